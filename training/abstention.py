@@ -19,7 +19,6 @@ from torch import Tensor
 from typer import Option
 
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.errors import InvalidInputError, check_number
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
@@ -32,8 +31,6 @@ from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
 Splits = Sequence[Rendered]
-FEWEST, MOST = 50, 500
-"""The least touches that a threshold is taken of; and samples looked at of each source and split."""
 
 
 def inputs_of(splits: Splits, modality: str, processor: UniTouchProcessor) -> Iterator[Tensor]:
@@ -72,13 +69,7 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     return math.exp(minimize_scalar(loss, bounds=(-12.0, 12.0), method="bounded").x)
 
 
-def fit_distance(
-    model: UniTouchModel,
-    processor: UniTouchProcessor,
-    train: Splits,
-    held: Splits,
-    share: float,
-) -> None:
+def fit_distance(model: UniTouchModel, processor: UniTouchProcessor, train: Splits, held: Splits, share: float) -> None:
     """Fits the distance of touches, and the threshold that a share of held-out touches is beyond."""
 
     def statistics(splits: Splits, column: str) -> Tensor:
@@ -94,8 +85,6 @@ def fit_distance(
     known, pictures = fit_gaussians(statistics(train, "touch")[rows], materials[rows]), statistics(train, "image")
     distance = RelativeDistance(known, fit_gaussians(pictures, torch.zeros(len(pictures))))
     far = distance(statistics(held, "touch")[pressed(held)])
-    if len(far) < FEWEST:
-        raise InvalidInputError(f"`data` holds out {len(far)} touches for a threshold; {FEWEST} are the least.")
     model.out_of_distribution["touch"] = distance
     model.config.ood_thresholds = {"touch": {"foreign": far.quantile(1.0 - share).item()}}
 
@@ -129,26 +118,25 @@ def abstention(
     joint: Annotated[Path, Option(help="Folder of the joint space, such as `joint` of a family; it is written to.")],
     recipe: Annotated[str, Option(help="Its `data` is fitted to.")] = "touch",
     overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
-    share: Annotated[float, Option(help="Share of known touches on which the model abstains, about.")] = 0.046,
+    share: Annotated[float, Option(min=0.001, max=0.5, help="Share of known touches on which it abstains.")] = 0.046,
     cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:
     """Fits what a joint space does not know, and writes it into its folder: no weight changes.
 
     A bank of image embeddings beside it, as in a family, is what touches are named by as well.
     """
-    check_number("share", share, 0.001, 0.5)
     data = read(DataConfig, read_recipe(recipe, overrides or ()).get("data"), "data")
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
-    needs, sources = (*MODALITIES, "material"), data.sources()
+    needs, sources, most = (*MODALITIES, "material"), data.sources(), 500  # samples of each source and split
     train = columns_of(sources, cache, data, processor, needs)
-    held = columns_of(data.held_out(MOST), cache, data, processor, needs, "val")
-    train, held = ([one.thinned(min(MOST, len(one))) for one in splits] for splits in (train, held))
+    held = columns_of(data.held_out(most), cache, data, processor, needs, "val")
+    train, held = ([one.thinned(min(most, len(one))) for one in splits] for splits in (train, held))
     fit_distance(model, processor, train, held, share)
     if data.drawn is not None:  # an encoder that has seen touches without a sensor's tokens
         fit_reaches(model, held, share / 2)
-    bank = joint.parent / EMBEDDING_BANK.name
-    pictures = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
-    fit_temperatures(model, processor, held, material_names(sources), pictures)
+    place = joint.parent / EMBEDDING_BANK.name
+    bank = EmbeddingBank.from_pretrained(place) if place.is_dir() else None
+    fit_temperatures(model, processor, held, material_names(sources), bank)
     with safe_open(next(joint.glob("model*.safetensors")), framework="pt") as stored:
         dtype = stored.get_tensor(next(key for key in stored.keys() if key.endswith("weight"))).dtype  # noqa: SIM118
     model.to(dtype).save_pretrained(joint)  # type: ignore[arg-type]

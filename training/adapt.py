@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, describe, needed
+from unitouch_gen.errors import InvalidInputError, needed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import AddedSensor, fingerprint, layout_distances
@@ -29,9 +29,6 @@ from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Seed, Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.training.watching import retrieval
-
-LAYERS = r"blocks\.\d+\.(attention\.qkv|attention\.out|mlp\.0|mlp\.2)"
-"""Linear layers of each block that get low-rank updates (Hu et al., 2022)."""
 
 
 class AdaptConfig(Settings):
@@ -89,8 +86,6 @@ def adapt(
     images: np.ndarray | None = None,
     groups: Sequence[str] | None = None,
     config: AdaptConfig | None = None,
-    *,
-    quiet: bool = False,
 ) -> AddedSensor:
     """Learns a sensor from its touches.
 
@@ -102,29 +97,20 @@ def adapt(
         groups: What each touch is of, such as its object: groups are kept together in the split. Each touch is one of
             its own where it is left out.
         config: How.
-        quiet: Whether to show no progress.
 
     Returns:
         The sensor, with `figures` of the touches that were held out, before and after.
 
     Raises:
-        InvalidInputError: If there are too few touches or groups, they do not fit, or the name is taken.
+        InvalidInputError: If there are too few touches or groups, or the name is taken.
     """
-    config, size = config or AdaptConfig(), model.config.touch_config.image_height
-    count = len(touches)
+    config, count = config or AdaptConfig(), len(touches)
     groups = [str(row) for row in range(count)] if groups is None else groups
     if name in model.sensors:
         raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
-    if count < 8:
-        raise InvalidInputError(f"Got {count} `touches`; `adapt` needs at least 8.")
-    if len(groups) != count or len(set(groups)) < 2:
-        raise InvalidInputError(
-            f"`groups` are {len(groups)} for {count} touches, {len(set(groups))} of them different; name that of each, "
-            "and two at least, or nothing can be held out."
-        )
-    for what, given in (("touches", touches), ("images", images)):
-        if given is not None and (given.dtype != np.uint8 or given.shape != (count, 3, size, size)):
-            raise InvalidInputError(f"`{what}` is {describe(given)}; it has to be uint8 ({count}, 3, {size}, {size}).")
+    if count < 8 or len(set(groups)) < 2:
+        given = f"{count} touches of {len(set(groups))} objects"
+        raise InvalidInputError(f"Got {given}; take 8 of 2 objects at least, or nothing can be held out.")
     encoder, bank = model.load("touch")
     kept, held = split_groups(groups, config.seed)
     mean = torch.from_numpy(touches[kept].mean(axis=0, keepdims=True) / 255).float()
@@ -134,9 +120,9 @@ def adapt(
         tokens = bank.tokens[int(bank.distances(prototype).argmin())].detach()
     torch.manual_seed(config.seed)
     network = copy.deepcopy(encoder).requires_grad_(False)
-    if config.rank:
-        peft = needed("peft")
-        lora = peft.LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=LAYERS)
+    if config.rank:  # low-rank updates of the linear layers of each block (Hu et al., 2022)
+        peft, layers = needed("peft"), r"blocks\.\d+\.(attention\.qkv|attention\.out|mlp\.0|mlp\.2)"
+        lora = peft.LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=layers)
         network = peft.inject_adapter_in_model(lora, network)
     trained = Adapted(network, tokens).eval()
 
@@ -153,7 +139,7 @@ def adapt(
     objective = AdaptObjective(trained, config.anchor, model.config.temperature)
     sampler = ShuffledSampler(len(kept), how.batch_size, config.seed)
     with TemporaryDirectory() as folder:
-        Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet).fit()
+        Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name).fit()
     figures["after"] = figures_of(trained, touches[held], pictures)
     figures |= {"touches": count, "held_out": len(held), "seed": config.seed}
     updates = peft.get_peft_model_state_dict(network) if config.rank else {}
@@ -186,21 +172,14 @@ def figures_of(network: Adapted, touches: np.ndarray, pictures: Tensor | None) -
 
 
 def learn(
-    folder: Path,
-    name: str,
-    model: Path | None = None,
-    config: AdaptConfig | None = None,
-    *,
-    log_fn: Callable[[str], object] = print,
-    quiet: bool = False,
-    **layout: Any,
+    folder: Path, name: str, model: Path | None, config: AdaptConfig, log_fn: Callable[[str], object], **layout: Any
 ) -> AddedSensor:
-    """Learns a sensor from a folder of its touches, in a layout that `open_dataset` knows; see `adapt`.
+    """Learns a sensor from a folder of its touches, in a layout that `open_dataset` knows by its arguments `layout`.
 
-    `layout` are arguments of `open_dataset`, `model` the folder of a joint space with its processor, the built-in one
-    if left out. `log_fn` gets a line on each thing that a user should know of the folder.
+    `model` is the folder of a joint space with its processor, the built-in one if it is `None`. `log_fn` gets a line on
+    each thing that a user should know of the folder.
     """
-    place = weights.JOINT if model is None else model
+    place = model or weights.JOINT
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)
     objects = [record.object or "" for record in data.records]
@@ -211,8 +190,8 @@ def learn(
         log_fn(f"{pictured} of {len(data)} touches have a picture, so no pictures are used; give one to each")
 
     def pixels(column: str) -> np.ndarray:
-        rows = tqdm(data.records, desc=f"{data.name}: {column}", mininterval=5.0, disable=quiet)
+        rows = tqdm(data.records, desc=f"{data.name}: {column}", mininterval=5.0)
         return np.stack([square(getattr(record, column), processor.image_size) for record in rows])
 
     images = pixels("picture") if pictured == len(data) else None
-    return adapt(joint, name, pixels("touch"), images, None if "" in objects else objects, config, quiet=quiet)
+    return adapt(joint, name, pixels("touch"), images, None if "" in objects else objects, config)

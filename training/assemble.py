@@ -26,8 +26,8 @@ X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
 
 def halved(sources: list[Path], target: Path) -> None:
     """Writes the weights of some files as one in fp16; integer and boolean tensors stay as they are."""
-    state = {key: value for source in sources for key, value in load_file(source).items()}
-    state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
+    stored = [item for source in sources for item in load_file(source).items()]
+    state = {key: value.half() if value.is_floating_point() else value for key, value in stored}
     save_file(state, target, metadata={"format": "pt"})
 
 
@@ -70,10 +70,8 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
         records[stage] = json.loads(file.read_text())
         for option, before in needs.items():
             if records[stage]["inputs"][option] != weights_of(runs / before / "model"):
-                raise InvalidInputError(
-                    f"`runs` holds {str(runs / stage)!r}, which was built on other weights than {before} holds now; "
-                    "remove it, and train it anew."
-                )
+                why = f"which was built on other weights than {before} holds now; remove it, and train it anew."
+                raise InvalidInputError(f"`runs` holds {str(runs / stage)!r}, {why}")
     return records
 
 
@@ -98,8 +96,8 @@ def assemble(
             half_folder(models[stage], place / stage.replace("_", "-"))
         write_generator(models["unclip"], place / "touch-to-image", TOUCH_TO_IMAGE)
         ldm = models["touch_ldm"]
-        defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        write_generator(ldm, place / "x-to-touch", defaults)
+        sensors = json.loads((ldm / "sensors.json").read_text())
+        write_generator(ldm, place / "x-to-touch", {"sensors": sensors, **X_TO_TOUCH})
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
         write_json({"training": records, "figures": {}}, place / "family.json")
 

@@ -47,40 +47,32 @@ def _rows(values: np.ndarray | Tensor | Sequence[np.ndarray], index: np.ndarray)
 
 
 class SamplerSettings(Settings):
-    """How a batch is drawn; see `InBatchSampler`."""
+    """How `InBatchSampler` draws a batch of B."""
 
-    sigma: Share | None = None  # share from one data set; null for batches that are uniform over all
-    group: PositiveInt = 1  # contacts of a group whose pictures are alike
+    # Share from one data set (paper: 0.75). At 0 the whole batch is from the others, as the paper's formula says; null
+    # chooses none: the batch is uniform over the union.
+    sigma: Share | None = None
+    group: PositiveInt = 1  # examples of the chosen one that are alike, the negatives that are hardest to tell apart
 
 
 class InBatchSampler:
     """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others (Eq. 4).
 
-    Called with a step number it returns that step's indices into the concatenation of the data sets.
-
-    Args:
-        sizes: Examples in each data set.
-        batch_size: B.
-        sigma: Share from the chosen data set (paper: 0.75). At 0 the whole batch is from the others, as the paper's
-            formula says. `None` chooses none: the batch is uniform over the union.
-        seed: Seed of all steps.
-        near: Vectors (N, D) of all examples. Those from the chosen data set then come in groups of `group`: an example
-            and others of those nearest to it, the negatives that are hardest to tell from it.
-        group: Examples of a group; at 1 there are none.
+    Called with a step number it returns that step's indices into the concatenation of the data sets, of some `sizes`.
+    Groups are of an example and others of those nearest to it, by vectors `near` (N, D) of all examples.
     """
 
     def __init__(
         self,
         sizes: Sequence[int],
         batch_size: int,
-        sigma: float | None = 0.75,
+        settings: SamplerSettings,
         seed: int = 0,
         near: np.ndarray | None = None,
-        group: int = 1,
     ):
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
-        self.near, self.group = near, group
-        self.share = share_of(sigma, batch_size, len(sizes))
+        self.near, self.group = near, settings.group
+        self.share = share_of(settings.sigma, batch_size, len(sizes))
 
     def __call__(self, step: int) -> list[int]:
         rng, total = np.random.default_rng((self.seed, step)), int(self.sizes.sum())
@@ -107,9 +99,7 @@ def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
     """How many of a batch are from the chosen one of `count` data sets; `None` where none is chosen."""
     share = None if sigma is None else round(sigma * batch_size)
     if share is not None and share < batch_size and count < 2:
-        raise InvalidInputError(
-            f"`sampler.sigma` is {sigma}, with no other data set to draw the rest from; set it to 1."
-        )
+        raise InvalidInputError(f"`sampler.sigma` is {sigma}, with no other data set to draw from; set it to 1.")
     return share
 
 

@@ -18,20 +18,10 @@ import torch
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import (
-    ArrayDataset,
-    Batch,
-    SamplerSettings,
-    add_noise,
-    blur_some,
-    in_deviations,
-    jitter_colours,
-    permute_channels,
-    shift_pixels,
-)
+from unitouch_gen.training import batches
+from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source, shown
 from unitouch_gen.training.data.drawn import DrawnGrasps
 from unitouch_gen.training.data.relit import relit_pictures
@@ -41,8 +31,6 @@ from unitouch_gen.training.recipe import Arguments, build
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.watching import pixels_of, retrieval
-
-MAX_LOGIT_SCALE = 100.0
 
 
 class ImageTextSettings(AttributeSettings):
@@ -60,9 +48,9 @@ class ImageTextRecipe(Recipe):
 
 
 class ImageTextObjective(nn.Module):
-    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it:
-    the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's embedding, and
-    InfoNCE between pictures under two lamps.
+    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it.
+
+    The squared error of attributes (B, K), in deviations, is of what is read linearly off a picture's embedding.
     """
 
     def __init__(self, model: UniTouchModel, settings: ImageTextSettings):
@@ -76,12 +64,13 @@ class ImageTextObjective(nn.Module):
         return self
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        raw = jitter_colours(shift_pixels(batch["image"].float() / 255, 4), gain=0.08, offset=0.03)
+        raw = batches.shift_pixels(batch["image"].float() / 255, 4)
+        raw = batches.jitter_colours(raw, gain=0.08, offset=0.03)
         image = self.model.get_image_features(normalise_pixels(raw))
         captions = batch["input_ids"]  # (B, captions, L)
         rows = torch.arange(len(captions))
         text = self.model.get_text_features(captions[rows, torch.randint(captions.shape[1], (len(captions),))])
-        temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
+        temperature = 1.0 / self.log_scale.exp().clamp(max=100.0)
         parts, near = {"text": symmetric_info_nce(image, text, temperature)}, batch["shown"]
         if self.settings.views:
             second = self.model.get_image_features(normalise_pixels(recoloured(batch["relit"].float() / 255)))
@@ -96,9 +85,10 @@ class ImageTextObjective(nn.Module):
 
 def recoloured(pictures: Tensor) -> Tensor:
     """Pictures (B, 3, S, S) in [0, 1] of which colour and brightness tell no more: shifted, some blurred or grey."""
-    other = jitter_colours(blur_some(permute_channels(shift_pixels(pictures, 2), 0.5), 0.3), gain=0.4, offset=0.12)
+    other = batches.permute_channels(batches.shift_pixels(pictures, 2), 0.5)
+    other = batches.jitter_colours(batches.blur_some(other, 0.3), gain=0.4, offset=0.12)
     grey = torch.rand(len(other), 1, 1, 1, device=other.device) < 0.3
-    return add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
+    return batches.add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
 
 
 def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -> list[list[str]]:
@@ -132,8 +122,7 @@ def main(stage: Stage) -> None:
     recipe, init = stage.read(ImageTextRecipe), stage.folders.get("init")
     config, objective = build("model", UniTouchConfig, recipe.model), recipe.objective
     build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
-    if objective.views and not all(isinstance(source, DrawnContacts) for source in stage.sources):
-        raise InvalidInputError("`objective.views` needs drawn contacts; set it to 0, or train on `data.drawn` alone.")
+    stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
     captions = captions_of(stage.sources, splits, objective.captions)
     texts = [caption for one in captions for caption in one]

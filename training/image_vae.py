@@ -36,8 +36,8 @@ class AutoencoderLoss(Settings):
 
 
 class AutoencoderAugmentation(Settings):
-    # Side of the squares, at random places, that a network of convolutions learns from; null for whole images.
-    # A quarter of the pixels cost a quarter of the time, and twice as many images are worth more than whole ones.
+    # Side of the squares that a network of convolutions learns from; null for whole images. A quarter of the pixels
+    # cost a quarter of the time, and twice as many images are worth more than whole ones.
     crop: PositiveInt | None = None
 
 
@@ -55,7 +55,10 @@ class AutoencoderObjective(nn.Module):
         self.trained, self.weights, self.crop = vae, weights, crop
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        pixels = to_signed(batch["pixels"] if self.crop is None else random_square(batch["pixels"], self.crop))
+        pixels = to_signed(batch["pixels"])
+        if self.crop is not None:  # a square at one random place for all, no larger than they are
+            top, left = (int(torch.randint(max(size - self.crop, 0) + 1, ())) for size in pixels.shape[-2:])
+            pixels = pixels[..., top : top + self.crop, left : left + self.crop]
         latents = encode_raw(self.trained, pixels).float()
         size = latents.square().mean()
         noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
@@ -68,12 +71,6 @@ class AutoencoderObjective(nn.Module):
             loss = loss + decoded.commit_loss.mean()
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
         return {"loss": loss, "psnr": psnr, "latent": size.detach()}
-
-
-def random_square(images: Tensor, side: int) -> Tensor:
-    """A square of images (B, C, H, W), at one random place for all, (B, C, side, side); no larger than they are."""
-    top, left = (int(torch.randint(max(size - side, 0) + 1, ())) for size in images.shape[-2:])
-    return images[..., top : top + side, left : left + side]
 
 
 def to_signed(pixels: Tensor) -> Tensor:

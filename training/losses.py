@@ -18,14 +18,9 @@ SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
 
 
 def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:
-    """Eq. 1 of the paper: - 1/B sum_i log softmax_j(q_i . k_j / tau)_i on unit vectors.
+    """Eq. 1 of the paper: - 1/B sum_i log softmax_j(q_i . k_j / tau)_i, of embeddings (B, D), normalised here.
 
-    Args:
-        query, key: Embeddings of B pairs, (B, D); normalised here.
-        temperature: tau > 0.
-
-    Relations:
-        Cross-entropy of the similarity matrix against its diagonal; log B for unrelated views.
+    Cross-entropy of the similarity matrix against its diagonal; log B for unrelated views.
     """
     logits = F.normalize(query.float(), dim=-1) @ F.normalize(key.float(), dim=-1).T / temperature
     return F.cross_entropy(logits, torch.arange(len(logits), device=logits.device))
@@ -59,12 +54,10 @@ def denoising_losses(
 
     Args:
         unet: Called as `unet(noisy, steps, **conditions)`.
-        scheduler: Schedule of the latents, predicting "epsilon" (Ho et al., 2020, Eq. 14) or "v_prediction" (Salimans &
-            Ho, 2022, Section 4).
+        scheduler: Predicting "epsilon" (Ho et al., 2020, Eq. 14) or "v_prediction" (Salimans & Ho, 2022, Section 4).
         latents: Clean and scaled, (B, C, h, w).
         snr_gamma: SNR above which all steps weigh the same; `inf` sets no bound.
         extra_channels: What the network is shown beside noisy latents, (B, C', h, w).
-        conditions: The network's.
 
     Returns:
         `loss`, and `mse`, the unweighted error.

@@ -16,7 +16,6 @@ from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor, nn
 from transformers import ResNetConfig
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import RELIEF_CHANNELS
@@ -86,11 +85,6 @@ class ClassifierObjective(nn.Module):
 
 def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()) -> ArrayDataset:
     """Images, their materials, and the attributes named: of touches by either sensor, of pictures the mean of both."""
-    if names and any(split.attributes is None for split in splits):
-        raise InvalidInputError(
-            "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train "
-            "on drawn contacts alone."
-        )
     chosen = [ATTRIBUTES.index(name) for name in names]
     pixels, material, attributes = list[Any](), list[Any](), list[Any]()
     for split in splits:
@@ -111,6 +105,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     numbers = {name: number for number, name in labels.items()}
     config = build("model", ResNetConfig, recipe.model, id2label=labels, label2id=numbers)
     names = SHOWN[modality] if recipe.objective.attributes else ()
+    stage.check_drawn(*(["attributes"] if names else []))
     dataset = columns(stage.splits(modality, "material"), modality, names)
     if names:
         values = np.asarray(dataset.columns["attributes"], np.float64)

@@ -46,10 +46,9 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     recipe = read_yaml("recipe", _file_of("recipe", path))
     data, drawn_by_base = recipe.get("data"), False
     if isinstance(data, dict) and "base" in data:
-        drawn_by_base = "drawn" not in data
+        drawn_by_base = "drawn" not in data and not any(one.startswith("data.drawn") for one in overrides)
         recipe["data"] = read_yaml("data.base", _file_of("data.base", data.pop("base"))) | data
     recipe = overridden(recipe, overrides)
-    drawn_by_base = drawn_by_base and not any(one.startswith("data.drawn") for one in overrides)
     if drawn_by_base and recipe["data"].get("sets"):
         recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}
     return recipe
@@ -89,12 +88,12 @@ def read(kind: type[SettingsKind], given: Any, section: str = "") -> SettingsKin
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, [*filter(None, [section]), *first["loc"]])) or "recipe"
+        message = f"`{key}` is {describe(first['input'])}; {first['msg'].replace('Input should', 'it has to')}."
         if "error" in first.get("ctx", {}):  # of a check of ours
-            raise InvalidInputError(f"In `{key}`, {first['ctx']['error']}") from error
-        if first["type"] == "missing":
-            raise InvalidInputError(f"`{key}` is missing in the recipe; set it.") from error
-        wanted = first["msg"].replace("Input should", "it has to")
-        raise InvalidInputError(f"`{key}` is {describe(first['input'])}; {wanted}.") from error
+            message = f"In `{key}`, {first['ctx']['error']}"
+        elif first["type"] == "missing":
+            message = f"`{key}` is missing in the recipe; set it."
+        raise InvalidInputError(message) from error
 
 
 def build(section: str, kind: Callable[..., Built], arguments: Arguments, **given: Any) -> Built:
@@ -115,5 +114,5 @@ def check_keys(given: Iterable[Any], known: Iterable[str]) -> None:
     """Refuses a key that is not known, with those that are and the one that was likely meant."""
     for key in given:
         if key not in known:
-            hint = f"`{key}` is unknown; there are {sorted(known)}. {did_you_mean(key, known)}"
-            raise InvalidInputError(hint.strip())
+            hint = did_you_mean(key, known)
+            raise InvalidInputError(f"`{key}` is unknown; there are {sorted(known)}. {hint}".strip())

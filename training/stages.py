@@ -49,7 +49,6 @@ STAGES: dict[str, dict[str, str]] = {
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
-
 Figures = Mapping[str, float]
 
 
@@ -80,18 +79,14 @@ class Stage:
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        before: dict[str, Any] = {}
-        if resume:
-            before = read_progress(self.output)
-            before["recipe"]["trainer"].pop("trackers", None)  # of checkpoints of earlier versions
-            self.recipe = overridden(before["recipe"], overrides or ())
-        elif found := checkpoints_in(self.output):
+        before = read_progress(self.output) if resume else {}
+        if (found := checkpoints_in(self.output)) and not resume:
             raise InvalidInputError(
                 f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
                 "`--resume` to go on with it, remove it, or name another output."
             )
-        else:
-            self.recipe = read_recipe(recipe or name, overrides or ())
+        changes = overrides or ()
+        self.recipe = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.trainer = read(TrainerConfig, self.recipe.get("trainer"), "trainer")
         self.data = read(DataConfig, self.recipe.get("data"), "data")
         folders = {"joint": joint, "vae": vae, "init": init}
@@ -99,14 +94,14 @@ class Stage:
         needs = {*STAGES[name]}
         if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
-            raise InvalidInputError(
-                f"{name} needs folders of models: {command_of(name, Path('runs'))}; it got {given}."
-            )
+            wanted = command_of(name, Path("runs"))
+            raise InvalidInputError(f"{name} needs folders of models: {wanted}; it got {given}.")
         self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
         if resume and before["inputs"] != self.inputs:
+            options = ", ".join(f"--{option}" for option in before["inputs"])
             raise InvalidInputError(
-                f"`resume` finds a run in {str(self.output)!r} that was built on other weights than "
-                f"{', '.join(f'--{option}' for option in before['inputs'])} name now; name those, or begin anew."
+                f"`resume` finds a run in {str(self.output)!r} that was built on other weights than {options} name "
+                "now; name those, or begin anew."
             )
         self.sources = self.data.sources()
         for option, folder in {"output": self.output, "cache": self.cache}.items():
@@ -141,8 +136,7 @@ class Stage:
 
     def watching(self, watch: Callable[[list[Rendered]], Figures], *needs: str) -> Callable[[], Figures] | None:
         """`watch` of about 64 held-out samples, with the columns that are needed; `None` where nothing is watched."""
-        every, steps = self.trainer.watch_every, self.trainer.steps
-        if not every or (steps is not None and steps < every) or not self.processes.is_main_process:
+        if not self.trainer.watch_every or not self.processes.is_main_process:
             return None
         known = {source.sensor for source in self.sources}
         sources = [source for source in self.data.held_out(64) if source.sensor in known]
@@ -161,10 +155,15 @@ class Stage:
         return image_embeddings(model, [split.image for split in splits], self.key(splits), self.cache)
 
     def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> InBatchSampler:
-        """Batches in groups whose embeddings (N, D) are alike; see `InBatchSampler`."""
+        """Batches in groups whose embeddings (N, D) are alike."""
         sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
-        trainer = self.trainer
-        return InBatchSampler(sizes, trainer.batch_size, settings.sigma, trainer.seed, near, settings.group)
+        return InBatchSampler(sizes, self.trainer.batch_size, settings, self.trainer.seed, near)
+
+    def check_drawn(self, *weights: str) -> None:
+        """Refuses data sets where the objective weighs what only drawn contacts have."""
+        if weights and not all(isinstance(source, DrawnContacts) for source in self.sources):
+            names = ", ".join(f"`objective.{name}`" for name in weights)
+            raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
 
     def fit(
         self,
@@ -177,8 +176,8 @@ class Stage:
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
-        progress = {"inputs": self.inputs, "recipe": self.recipe}
-        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, progress, watch)
+        begun = {"inputs": self.inputs, "recipe": self.recipe}
+        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun, watch)
         if self.resume:
             trainer.resume()
         trainer.fit()
@@ -188,16 +187,12 @@ class Stage:
     def saving(self, **figures: Any) -> Iterator[Path]:
         """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
         record: dict[str, Any] = {
-            "stage": self.name,
-            "seed": self.trainer.seed,
-            "seconds": round(self.seconds, 1),
-            "version": __version__,
-            "inputs": self.inputs,
-            "trainer": self.trainer.model_dump(),
+            "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
+            "inputs": self.inputs, "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
             "sets": [source.summary for source in self.sources],
             **figures,
-        }
+        }  # fmt: skip
         for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
             if (beside / "record.json").is_file():  # beside a run's `model`, or a part of that
                 record["started_from"] = json.loads((beside / "record.json").read_text())

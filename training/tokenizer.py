@@ -21,15 +21,10 @@ PROMPTS = (
 
 
 def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> CLIPTokenizer:
-    """Byte-pair encoding in CLIP's form, with ids start = n - 2 and end = n - 1 as in CLIP.
+    """Byte-pair encoding in CLIP's form, with ids start = n - 2 and end = n - 1, of texts to learn merges from.
 
-    Args:
-        texts: To learn merges from; every byte is in the vocabulary, so any text can be encoded.
-        vocab_size: Largest vocabulary; 514 hold the bytes, within a word and at its end, with start and end.
-        max_length: Tokens a text is padded or cut to.
-
-    Raises:
-        InvalidInputError: If the vocabulary is too small for every byte.
+    Every byte is in the vocabulary, so any text can be encoded: 514 pieces hold the bytes, within a word and at its
+    end, with start and end. Texts are padded or cut to `max_length` tokens.
     """
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2, 10**6)

@@ -51,9 +51,9 @@ class LossWeights(Settings):
     maps: NonNegativeFloat = 0.0  # the same of measures in each part of the view, read off the patches' tokens
 
     @property
-    def pairs(self) -> bool:
-        """Whether anything weighs that only drawn contacts have."""
-        return bool(self.touch or self.attributes or self.maps)
+    def pairs(self) -> list[str]:
+        """The weights above 0 of what only drawn contacts have."""
+        return [name for name in ("touch", "attributes", "maps") if getattr(self, name)]
 
     @model_validator(mode="after")
     def _something_is_weighed(self) -> Self:
@@ -80,12 +80,11 @@ class TouchEncoder(nn.Module):
         self.reader = nn.Linear(config.projection_dim, len(ATTRIBUTES)) if weights.attributes else None
         self.mapper = nn.Linear(config.hidden_size, len(MAPS)) if weights.maps else None
 
-    def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> Tensor:
-        """Embeddings (B, D); those of sensors below 0 have no tokens."""
-        return self.features(pixel_values, sensor_ids)[0]
+    def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8).
 
-    def features(self, pixel_values: Tensor, sensor_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8)."""
+        Those of sensors below 0 have no tokens.
+        """
         tokens = self.bank.encode(self._tokens, pixel_values, sensor_ids)
         tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
         patches = self.transformer.norm(tokens[:, 1:]).transpose(1, 2).unflatten(2, self.grid)
@@ -98,9 +97,7 @@ class TouchEncoder(nn.Module):
 
 
 class TouchObjective(nn.Module):
-    """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and the frozen embeddings of their pictures, and what else has a
-    weight.
-    """
+    """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and frozen embeddings of their pictures, and other losses."""
 
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation, weights: LossWeights | None = None):
         super().__init__()
@@ -110,15 +107,13 @@ class TouchObjective(nn.Module):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         trained, weights = self.trained, self.weights
-        touch, patches = trained.features(self.augmented(batch["touch"]), batch["sensor"])
+        touch, patches = trained(self.augmented(batch["touch"]), batch["sensor"])
         picture, near = batch["image_embeds"], batch["shown"]
-        parts = {
-            "image": symmetric_info_nce(touch, picture, self.temperature),
-            "cosine": cosine_distance(touch, picture, near),
-        }
+        parts = {"image": symmetric_info_nce(touch, picture, self.temperature)}
+        parts["cosine"] = cosine_distance(touch, picture, near)
         if weights.pairs:
             unnamed = torch.full_like(batch["sensor"], -1)
-            second, other_patches = trained.features(self.augmented(batch["second"]), unnamed)
+            second, other_patches = trained(self.augmented(batch["second"]), unnamed)
             parts["image"] = 0.5 * (parts["image"] + symmetric_info_nce(second, picture, self.temperature))
             parts["cosine"] = parts["cosine"] + cosine_distance(second, picture, near)
             parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
@@ -170,15 +165,8 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
 
 
-def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
+def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
     """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation."""
-    if not weights.pairs:
-        return {}
-    if any(split.second is None for split in splits):
-        raise InvalidInputError(
-            "`objective` weighs pairs of touches, attributes or maps, which only `data.drawn` has; set these to 0, or "
-            "train on drawn contacts alone."
-        )
     attributes, maps = (np.concatenate([getattr(split, name) for split in splits]) for name in ("attributes", "maps"))
     return {
         "second": [split.second for split in splits],
@@ -190,19 +178,20 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
 def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, heldout: list[Rendered]) -> dict[str, float]:
     """Retrieval of pictures by touches."""
     sensors, device = torch.from_numpy(sensor_numbers(heldout, model.config.sensors)), encoder.bank.tokens.device
-    touch = encoder(pixels_of(heldout, "touch", device), sensors.to(device))
+    touch, _ = encoder(pixels_of(heldout, "touch", device), sensors.to(device))
     return retrieval(touch, model.get_image_features(pixels_of(heldout, "image")))
 
 
 def main(stage: Stage) -> None:
     recipe = stage.read(TouchRecipe)
+    stage.check_drawn(*recipe.objective.pairs)
     share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     model = stage.joint_space("image")
     splits = stage.splits("image", "touch", "sensor")
     embeds = stage.image_embeddings(model, splits)
-    named = list(dict.fromkeys(split.sensor for split in splits if split.sensor is not None))
-    model.config.sensors = [] if recipe.sensors.tokens == 0 else named
-    model.config.sensor_tokens = recipe.sensors.tokens or model.config.sensor_tokens
+    tokens, named = recipe.sensors.tokens, dict.fromkeys(split.sensor for split in splits if split.sensor is not None)
+    model.config.sensors = [] if tokens == 0 else [*named]
+    model.config.sensor_tokens = tokens or model.config.sensor_tokens
     model.add("touch")
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
@@ -213,7 +202,7 @@ def main(stage: Stage) -> None:
         sensor=sensor_numbers(splits, model.config.sensors),
         shown=shown(stage.sources, splits),
         touch=[split.touch for split in splits],
-        **pairs_of(splits, recipe.objective),
+        **(pairs_of(splits) if recipe.objective.pairs else {}),
     )
     objective = TouchObjective(model, recipe.augment, recipe.objective)
     watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")

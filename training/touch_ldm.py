@@ -6,9 +6,9 @@
 It is trained on image embeddings alone, so text and sound, bound to images, can take their place. The autoencoder and
 the encoder of the condition are frozen: what they say of the training data is computed once.
 
-A network with twice the input channels of a latent is shown what the sensor sees untouched beside the noise, as
-InstructPix2Pix (Brooks et al., 2023) is shown its picture. So it learns sensors that have no name, too: their class is
-the one behind those of the named ones.
+Of drawn contacts, the network is shown what the sensor sees untouched beside the noise, as InstructPix2Pix (Brooks et
+al., 2023) is shown its picture. So it learns sensors that have no name, too: their class is the one behind those of the
+named ones.
 """
 
 import json
@@ -106,21 +106,16 @@ def main(stage: Stage) -> None:
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
-    with_gels = recipe.model.get("in_channels") == 2 * channels
     drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
-    needed = None in [source.sensor for source in drawn]
-    if (with_gels and len(drawn) < len(stage.sources)) or (needed and not with_gels):
-        raise InvalidInputError(
-            f"`model.in_channels` is {recipe.model.get('in_channels')}; at {2 * channels} the network is shown "
-            "untouched gels, which `data.drawn` alone has, and which sensors drawn anew, `null`, need; else it is "
-            f"{channels}."
-        )
+    with_gels = len(drawn) == len(stage.sources)
+    if not with_gels and None in [source.sensor for source in drawn]:
+        raise InvalidInputError("`data.drawn.sensors` has a null, which `data.sets` do not go with; leave one out.")
     classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
     unet = stage.unet(recipe.model, num_class_embeds=classes)
     wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
     if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
         raise InvalidInputError(
-            f"The network has {wrong}; for latents of `vae` and the sensors of the data it takes {wanted}. Change "
+            f"The network has {wrong}; for latents of `vae` and the sensors of `data` it takes {wanted}. Change "
             "`model`, or name another `init`."
         )
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)

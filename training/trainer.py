@@ -2,9 +2,9 @@
 
 An objective is an `nn.Module` whose `forward(batch)` returns a dict of scalar tensors with a `loss`, and whose
 `trained` module is what the optimiser changes. A batch follows from the number of its step, as do noise and
-augmentation, so a run that was killed goes on with exactly the batches it would have seen, however many workers read
-them. `accelerate launch` runs it in several processes, by `DistributedDataParallel`: each works on its rows of a batch,
-with noise of its own, and gradients are averaged.
+augmentation, so a run that was killed goes on with exactly the batches it would have seen. `accelerate launch` runs it
+in several processes, by `DistributedDataParallel`: each works on its rows of a batch, with noise of its own, and
+gradients are averaged.
 """
 
 import json
@@ -27,7 +27,6 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import update_bn
-from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
@@ -58,7 +57,6 @@ class TrainerConfig(Settings):
         BeforeValidator(lambda value: "no" if value is False else value),  # as YAML 1.1 reads a bare no
     ] = "no"
     gradient_checkpointing: bool = False  # compute what blocks made once more on the way back, in place of keeping it
-    workers: NonNegativeInt = 0  # processes that read batches ahead, for each that trains
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     watch_every: NonNegativeInt = 250  # steps between looks at held-out data; 0 never looks
@@ -87,10 +85,9 @@ class Trainer:
         output: Path,
         progress: Mapping[str, Any] | None = None,
         watch: Callable[[], Mapping[str, float]] | None = None,
-        quiet: bool = False,
     ):
         self.config, self.output, self.progress, self.watch = config, output, dict(progress or {}), watch
-        self.dataset, self.indices_of, self.quiet = dataset, indices_of, quiet
+        self.dataset, self.indices_of = dataset, indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds = 0, 0.0
         AcceleratorState._reset_state()  # a training before in the same process may have had another precision
@@ -100,9 +97,7 @@ class Trainer:
         )
         self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes
         if config.batch_size % processes:
-            raise InvalidInputError(
-                f"`batch_size` is {config.batch_size}; take a multiple of the {processes} processes."
-            )
+            raise InvalidInputError(f"`batch_size` is {config.batch_size}; take a multiple of {processes} processes.")
         self.trained: nn.Module = objective.trained  # type: ignore[assignment]
         if config.gradient_checkpointing:
             checkpoint_gradients(self.trained)
@@ -124,10 +119,8 @@ class Trainer:
         try:
             self.accelerator.load_state(str(checkpoint))
         except (RuntimeError, ValueError, KeyError) as error:
-            raise InvalidInputError(
-                f"`resume` finds {str(checkpoint)!r}, which does not fit this recipe's model and trainer: "
-                f"{first_line(error)} Go on with the recipe it began with, or name another output."
-            ) from error
+            why = f"does not fit this recipe's model and trainer: {first_line(error)}"
+            raise InvalidInputError(f"`resume` finds {str(checkpoint)!r}, which {why}") from error
         if self.ema is not None:
             self.ema.to(self.accelerator.device)  # accelerate reads it onto the CPU
         self.step, self.seconds = progress["step"], progress["seconds"]
@@ -142,17 +135,14 @@ class Trainer:
         if self.main and self.step == 0:  # what an earlier run left
             (self.output / "log.jsonl").unlink(missing_ok=True)
             shutil.rmtree(self.output / "checkpoints", ignore_errors=True)
-        rows: Any = map(self._rows, range(self.step, self.steps))  # read once, so tqdm gets the one iterator over it
-        dataset: Any = self.dataset
-        loader = iter(DataLoader(dataset, batch_size=None, sampler=rows, num_workers=config.workers))
-        bar = {"desc": self.output.name, "mininterval": 5.0, "disable": self.quiet or not self.main}
         self.objective.train()
-        with tqdm(loader, initial=self.step, total=self.steps, **bar) as batches:
-            for batch in batches:
-                losses = self.train_step(batch)
+        bar = {"desc": self.output.name, "mininterval": 5.0, "disable": not self.main}
+        with tqdm(range(self.step, self.steps), initial=self.step, total=self.steps, **bar) as steps:
+            for step in steps:
+                losses = self.train_step(self.dataset[self._rows(step)])
                 self.step += 1
                 self.seconds = time.monotonic() - started
-                batches.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
+                steps.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
                 if self.step % 20 == 0 or self.step == self.steps:
                     self._log({"rate": float(self.schedule.get_last_lr()[0]), **losses})
                 if self.watch is not None and config.watch_every and self.step % config.watch_every == 0 and self.main:

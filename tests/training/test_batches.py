@@ -12,7 +12,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training import batches
 from unitouch_gen.training.audio import roll_in_time
-from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
 
 
 def test_a_batch_is_a_copy_of_its_rows_of_every_column() -> None:
@@ -29,7 +29,7 @@ def test_a_batch_is_a_copy_of_its_rows_of_every_column() -> None:
     assert len(dataset) == len(ArrayDataset(array=np.arange(11))) == 11
 
 
-SIZES = np.array([300, 100, 200])
+SIZES, SIGMA = np.array([300, 100, 200]), SamplerSettings(sigma=0.75)
 
 
 def sources(batch: list[int], sizes: np.ndarray = SIZES) -> np.ndarray:
@@ -38,7 +38,7 @@ def sources(batch: list[int], sizes: np.ndarray = SIZES) -> np.ndarray:
 
 
 def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() -> None:
-    sampler = InBatchSampler(SIZES, 20, 0.75, seed=3)
+    sampler = InBatchSampler(SIZES, 20, SIGMA, seed=3)
     counts = np.stack([sources(sampler(step)) for step in range(1500)])
     assert (counts.max(axis=1) == 15).all() and (counts.sum(axis=1) == 20).all()  # the rest is never of the chosen one
     chosen = np.eye(3, dtype=bool)[counts.argmax(axis=1)]
@@ -46,7 +46,7 @@ def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() 
     others = np.where(chosen, 0, SIZES)
     expected = (5 * others / others.sum(axis=1, keepdims=True)).sum(axis=0)
     np.testing.assert_allclose(np.where(chosen, 0, counts).sum(axis=0), expected, rtol=0.05)
-    uniform = sum(sources(InBatchSampler(SIZES, 24, None, seed=2)(step)) for step in range(500))
+    uniform = sum(sources(InBatchSampler(SIZES, 24, SamplerSettings(), seed=2)(step)) for step in range(500))
     assert chisquare(uniform, uniform.sum() * SIZES / SIZES.sum()).pvalue > 0.01
 
 
@@ -57,7 +57,7 @@ def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> Non
     assert {index for epoch in epochs for index in epoch} == {*range(103)}
 
 
-@pytest.mark.parametrize("make", [lambda s: InBatchSampler(SIZES, 16, 0.75, s), lambda s: ShuffledSampler(50, 8, s)])
+@pytest.mark.parametrize("make", [lambda s: InBatchSampler(SIZES, 16, SIGMA, s), lambda s: ShuffledSampler(50, 8, s)])
 def test_a_batch_follows_from_the_number_of_its_step(make: Callable) -> None:
     sampler = make(7)
     later = [sampler(step) for step in (9, 3, 9)]
@@ -67,7 +67,7 @@ def test_a_batch_follows_from_the_number_of_its_step(make: Callable) -> None:
 
 def test_batches_that_cannot_be_filled_are_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"`sampler\.sigma` is 0\.75, with no other data set"):
-        InBatchSampler([100], 16, 0.75)
+        InBatchSampler([100], 16, SIGMA)
     with pytest.raises(InvalidInputError, match="`batch_size` is 64, but there are 5 samples"):
         ShuffledSampler(5, 64)
 
@@ -133,7 +133,7 @@ def test_jitter_is_one_line_for_each_channel_and_noise_has_a_level_for_each_imag
 
 def test_groups_are_of_an_example_and_others_of_its_nearest() -> None:
     near = np.eye(10)[np.arange(600) // 60]  # ten kinds of sixty alike
-    sampler = InBatchSampler([600, 600], 16, 0.5, seed=1, near=np.concatenate([near, near]), group=4)
+    sampler = InBatchSampler([600, 600], 16, SamplerSettings(sigma=0.5, group=4), 1, np.concatenate([near, near]))
     rows = np.array(sampler(3))
     assert len(set(rows[:8].tolist())) == 8 and sampler(3) == rows.tolist()
     for group in rows[:8].reshape(2, 4):

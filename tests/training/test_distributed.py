@@ -37,7 +37,7 @@ def main(output: Path, resumed: bool) -> None:
     times = {"steps": 6, "warmup": 1, "save_every": 3, "keep_checkpoints": 2}
     config = TrainerConfig(**times, batch_size=8, learning_rate=0.05, ema_decay=0.5)
     objective = Matching()
-    trainer = Trainer(objective, data, ShuffledSampler(32, 8), config, output, quiet=True)
+    trainer = Trainer(objective, data, ShuffledSampler(32, 8), config, output)
     if resumed:
         trainer.resume()
         assert trainer.step == 3

@@ -119,13 +119,13 @@ def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Pa
     assert {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in {*kinds} - decayed}
 
 
-@pytest.mark.parametrize(("killed_at", "ema_decay", "workers"), [(5, 0.9, 0), (13, 0.0, 0), (8, 0.9, 1)])
-def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, ema_decay: float, workers: int) -> None:
+@pytest.mark.parametrize(("killed_at", "ema_decay"), [(5, 0.9), (13, 0.0)])
+def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, ema_decay: float) -> None:
     whole, expected = make(tmp_path / "whole", ema_decay=ema_decay, options={"noise": 0.1})
     whole.fit()
     for stop_at, steps in ((killed_at, killed_at // 5 * 5), (None, 20), (None, 20)):
-        changes = {"ema_decay": ema_decay, "workers": workers, "options": {"noise": 0.1, "stop_at": stop_at}}
-        trainer, objective = make(tmp_path / "killed", **changes)
+        options = {"noise": 0.1, "stop_at": stop_at}
+        trainer, objective = make(tmp_path / "killed", ema_decay=ema_decay, options=options)
         if stop_at is not None:
             with pytest.raises(KeyboardInterrupt):
                 trainer.fit()

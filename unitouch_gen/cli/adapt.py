@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Argument, Option, echo
 
 from unitouch_gen.cli.data import BGR, Pattern, layout_of
-from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, note, print_table
+from unitouch_gen.cli.options import Overwrite, check_new, note, print_table
 from unitouch_gen.errors import InvalidInputError
 
 COUNTED = {
@@ -43,7 +43,7 @@ def adapt(
     check_writable("--output", file)
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
     layout = {"kind": kind, "bgr": bgr, **layout_of(None, pattern)}
-    made = learn(path, sensor, model, config, log_fn=note, quiet=is_quiet(False), **layout)
+    made = learn(path, sensor, model, config, note, **layout)
     made.save(file)
     before, after = made.figures["before"], made.figures["after"]
     counted = [(words, before[name], after[name]) for name, words in COUNTED.items() if name in before]
