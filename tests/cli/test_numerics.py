@@ -53,8 +53,8 @@ def test_a_saved_pipeline_takes_the_place_of_the_built_in_ones(command, models, 
 def test_a_chart_of_error_and_time(here, command, models, target):
     words = ["--problem", "mixture-7.5"]
     if target == "pipeline":
-        words = ["--pipeline", "x-to-touch", "--model", models["x-to-touch"], "--conditions", 1, "--guidance-scale", 2]
-    points = ["--solvers", "euler,adaptive", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1, "--repeats", 1]
+        words = ["--pipeline", "x-to-touch", "--model", models["x-to-touch"], "--guidance-scale", 2]
+    points = ["--solvers", "euler,adaptive", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1]
     code, out, err = command("work-precision", *words, *points, "-o", "chart")
     assert code == 0 and "Chart and results are in" in out, err
     rows = json.loads((here / "chart/results.json").read_text())["rows"]

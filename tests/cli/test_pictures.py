@@ -1,6 +1,5 @@
 """`unitouch-gen touch-to-image`, `stylize` and `x-to-touch` on tiny random pipelines: pictures, and what is printed."""
 
-import io
 import json
 import shutil
 from pathlib import Path
@@ -134,13 +133,6 @@ def test_words_stand_for_files(here, run, words, stems):
         recordings.write(here / "in" / "press.mp4", list(recordings.frames()))
     rows = run(f"touch-to-image {words} -o out")["pictures"]
     assert [Path(row["picture"]).stem for row in rows] == stems
-
-
-def test_standard_input_is_a_touch(here, run, monkeypatch):
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO((here / "in" / "dark.png").read_bytes())))
-    run("touch-to-image - -o out")
-    run("touch-to-image in/dark.png -o out")
-    assert same("out/stdin.png", "out/dark.png", tolerance=0)
 
 
 # Files, and what is printed -------------------------------------------------------------------------------------------

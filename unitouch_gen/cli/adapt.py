@@ -6,14 +6,8 @@ from typing import Annotated
 from typer import Argument, Option, echo
 
 from unitouch_gen.cli.data import BGR, Pattern, layout_of
-from unitouch_gen.cli.options import Overwrite, check_new, note, print_table
+from unitouch_gen.cli.options import Overwrite, check_output, note, print_table
 from unitouch_gen.errors import InvalidInputError
-
-COUNTED = {
-    "view": "another view of a touch is nearest to it",
-    "picture": "its own picture is nearest to it",
-}
-"""What is counted of the touches that were held out."""
 
 
 def adapt(
@@ -32,23 +26,19 @@ def adapt(
 
     Example: unitouch-gen adapt touches/ --sensor mine
     """
-    from unitouch_gen.files import check_writable
     from unitouch_gen.training.adapt import AdaptConfig, learn
 
     file = output or Path(f"{sensor}.safetensors")
     if file.suffix != ".safetensors":
         raise InvalidInputError(f"`--output` is {str(file)!r}; name a .safetensors file.")
-    if not overwrite:
-        check_new([file])
-    check_writable("--output", file)
+    check_output([file], overwrite)
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
-    layout = {"kind": kind, "bgr": bgr, **layout_of(None, pattern)}
-    made = learn(path, sensor, model, config, note, **layout)
+    made = learn(path, sensor, model, config, note, kind=kind, bgr=bgr, **layout_of(None, pattern))
     made.save(file)
-    before, after = made.figures["before"], made.figures["after"]
-    counted = [(words, before[name], after[name]) for name, words in COUNTED.items() if name in before]
-    rows = [[words, *(f"{share:.0f} %" for share in (*shares, before["chance"]))] for words, *shares in counted]
-    held_out = made.figures["held_out"]
+    before, after, held_out = (made.figures[name] for name in ("before", "after", "held_out"))
+    counted = {"view": "another view of a touch is nearest to it", "picture": "its own picture is nearest to it"}
+    shares = {name: (before[name], after[name], before["chance"]) for name in counted if name in before}
+    rows = [[counted[name], *(f"{share:.0f} %" for share in found)] for name, found in shares.items()]
     print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
     if held_out < 20:  # of which half, 50 %, is right within 22
         echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")

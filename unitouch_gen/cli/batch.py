@@ -6,7 +6,7 @@ A picture that is there is not made again: the same command goes on where one wa
 import csv
 import inspect
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,14 +43,13 @@ def batch(
     Example: unitouch-gen batch touches/ -o pictures/
     """
     check_choice("--pipeline", pipeline, CLASSES)
-    rows = list(in_folder(source, pipeline) if source.is_dir() else in_list(source))
+    rows = in_folder(source, pipeline) if source.is_dir() else in_list(source)
     import torch
     from accelerate import PartialState
     from accelerate.utils import gather_object
     from tqdm import tqdm
 
     from unitouch_gen import pipelines
-    from unitouch_gen.files import check_writable
 
     known = inspect.signature(getattr(pipelines, CLASSES[pipeline]).__call__).parameters
     columns = ["name", "seed", *(column for column in (*OWN, *options.SETTABLE) if column in known)]
@@ -60,7 +59,7 @@ def batch(
     folder = source if source.is_dir() else source.parent
     pictures = pictures_of([shared | checked(row, columns, folder) for row in rows], output)
     manifest = output / "manifest.jsonl"
-    check_writable("--output", manifest)
+    options.check_output([manifest], overwrite=True)
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
     calls = calls_of([picture for picture in pictures if not picture.file.exists()], batch_size)
@@ -70,7 +69,7 @@ def batch(
     pipe = load_pipeline(pipeline, quiet=options.is_quiet(False), **context.params) if calls else None
     output.mkdir(parents=True, exist_ok=True)
     with state.split_between_processes(calls) as mine:
-        for call in tqdm(mine, unit="call", disable=options.is_quiet(False) or not state.is_main_process):
+        for call in tqdm(mine, unit="call", disable=None if state.is_main_process else True):
             made = make(pipe, call)
             with manifest.open("a", encoding="utf-8") as stream:
                 stream.write("".join(f"{json.dumps(line)}\n" for _, line in made))
@@ -90,17 +89,16 @@ def batch(
 # The list -------------------------------------------------------------------------------------------------------------
 
 
-def in_folder(folder: Path, pipeline: str) -> Iterator[dict[str, str]]:
+def in_folder(folder: Path, pipeline: str) -> list[dict[str, str]]:
     """The columns of every file of a folder and those below, which names its picture by its place."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
-    for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() in columns and file.is_file():
-            place = file.relative_to(folder)
-            yield {columns[file.suffix.lower()]: str(place), "name": str(place.with_suffix(""))}
+    files = [file for file in sorted(folder.rglob("*")) if file.suffix.lower() in columns and file.is_file()]
+    places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
+    return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
 
 
-def in_list(file: Path) -> Iterator[dict[str, Any]]:
+def in_list(file: Path) -> list[dict[str, Any]]:
     """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
     from unitouch_gen.files import read_text
 
@@ -111,23 +109,20 @@ def in_list(file: Path) -> Iterator[dict[str, Any]]:
         else:
             rows = [dict(json.loads(line)) for line in lines if line.strip()]
     except (csv.Error, ValueError, TypeError, RecursionError) as error:
-        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
-        raise InvalidInputError(message) from error
-    for row in rows:
-        yield {column: value for column, value in row.items() if value not in (None, "")}
+        why = f"which is no .csv or .jsonl: {first_line(error)}."
+        raise InvalidInputError(f"`source` is {str(file)!r}, {why}") from error
+    return [{column: value for column, value in row.items() if value not in (None, "")} for row in rows]
 
 
 def checked(row: Mapping[str, Any], columns: Sequence[str], folder: Path) -> dict[str, Any]:
     """Columns as arguments of a call; names of files start from a folder."""
     found: dict[str, Any] = {}
     for column, value in row.items():
-        check_choice("column", column, columns)
-        if column in ("name", *OWN):
-            found[column] = check_kind(column, value, str)
-        else:
-            found[column] = options.value_of(value) if isinstance(value, str) else value
-        if column in FILES:
-            found[column] = str(folder.absolute() / value)
+        if check_choice("column", column, columns) in ("name", *OWN):
+            check_kind(column, value, str)
+        elif isinstance(value, str):
+            value = options.value_of(value)
+        found[column] = str(folder.absolute() / value) if column in FILES else value
     return found
 
 

@@ -58,16 +58,11 @@ def evaluate(
     """
     check_choice("table", table, (*TABLES, "all"))
     names = asked_for(table, model)
-    from unitouch_gen.files import check_writable
     from unitouch_gen.training.data import open_dataset
     from unitouch_gen.training.data.heldout import of_datasets, of_world
 
     if output is not None:
-        files = [output / f"{name}.json" for name in names]
-        check_writable("--output", files[0])
-        if not overwrite:
-            options.check_new(files)
-
+        options.check_output([output / f"{name}.json" for name in names], overwrite)
     layout = layout_of(materials, pattern)
     folders = [open_dataset(folder, kind, sensor=sensor, bgr=bgr, **layout) for folder in data or ()]
     pipes = {name: load_pipeline(name, model=model, device=device) for name in names if name in GENERATED}
@@ -110,9 +105,10 @@ def asked_for(table: str, model: str | None) -> list[str]:
 
 def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
     """Refuses models and data sets that lack what a table needs, before their files are read."""
+    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
 
-    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name)
+    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
     asked = {"text"} if label else {"image"} if name == "touch-to-image" else {"image", "audio", "text"}
     usable = asked & {*joint.known_modalities}
     if "touch" not in joint.known_modalities or not usable:
@@ -122,32 +118,20 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
         raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
     for data in folders:
         parts = parts_of(data)
-        if label:
-            check_classes(label, data, parts)
-        elif not usable & {*modalities_of(data)}:
+        for split, part in parts.items() if label else ():
+            found = {data.classes[label][r.labels[label]] for r in part.records if label in r.labels}
+            if len(found) < 2 or (label == "grasp" and not found <= {*GRASP_PROMPTS}):
+                wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
+                has = f"{', '.join(sorted(found)) or 'none'} of {label} to {split} on"
+                raise InvalidInputError(f"{data} has the classes {has}, not {wanted}.")
+        if not label and not usable & {*modalities_of(data)}:
             raise InvalidInputError(f"{data} has no {' or '.join(sorted(usable))} of every touch.")
         if not all(drawable(name, pipe, record.sensor) for record in data.records):
             known = ", ".join(pipe.config.sensors or ())
             raise InvalidInputError(f"{data} was felt by sensors other than {known}, which the model draws for.")
-        train, test = len(parts["train"]), len(parts["test"])
         least = each * len({record.labels.get("material") for record in parts["test"].records}) + 2
-        if name in GENERATED and (train < 6 or test < least):
-            raise InvalidInputError(
-                f"{data} has {train} contacts to fit to and {test} to draw of; {name!r} needs 6 and {least}, 2 "
-                "more than `--each` asks for."
-            )
-
-
-def check_classes(label: str, data: "RecordSet", parts: "Mapping[str, RecordSet]") -> None:
-    """Refuses splits in which there is one class or none, and labels of grasps that there are no prompts for."""
-    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
-
-    wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
-    for split, part in parts.items():
-        classes = {data.classes[label][r.labels[label]] for r in part.records if label in r.labels}
-        if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
-            found = ", ".join(sorted(classes)) or "none"
-            raise InvalidInputError(f"{data} has the classes {found} of {label} to {split} on, not {wanted}.")
+        if name in GENERATED and len(parts["test"]) < least:
+            raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
 
 
 def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
@@ -181,24 +165,22 @@ def figures_of(
     for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
         for name in names:
-            rows: dict[str, dict[str, float]]
             if name in asking:
-                rows = {row: {f"{sensor}, {domain}": share} for row, share in asking[name](splits, embed).items()}
+                found = {row: {f"{sensor}, {domain}": share} for row, share in asking[name](splits, embed).items()}
+            elif name == "retrieval":
+                found = tables.retrieval_table(splits)
+            elif (name, domain, seed) not in drawn and all(
+                drawable(name, pipes[name], one) for one in splits["test"].sensors
+            ):
+                drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
+                found, shown = drawing[name](pipes[name], splits, judges, each, seed)
+                images.setdefault(name, shown)
             else:
-                if name == "retrieval":
-                    figures = tables.retrieval_table(splits)
-                elif (name, domain, seed) in drawn or not all(
-                    drawable(name, pipes[name], sensor) for sensor in splits["test"].sensors
-                ):
-                    continue  # images take time, so they are of one sensor of each domain
-                else:
-                    drawn.add((name, domain, seed))
-                    figures, shown = drawing[name](pipes[name], splits, judges, each, seed)
-                    images.setdefault(name, shown)
-                rows = {f"{row}, {domain}": values for row, values in figures.items()}
-            for row, values in rows.items():
+                continue
+            for row, values in found.items():
+                columns = made[name].setdefault(row if name in asking else f"{row}, {domain}", {})
                 for column, value in values.items():
-                    made[name].setdefault(row, {}).setdefault(column, []).append(value)
+                    columns.setdefault(column, []).append(value)
     return made, images
 
 
@@ -223,8 +205,8 @@ def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None
     if output is None:
         return
     write_file("--output", output / f"{name}.json", json.dumps({"table": name, "rows": rows, **facts}, indent=2) + "\n")
-    page = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
-    page = [f"## {TABLES[name]}", "", *page, "", f"Means over worlds, in brackets their spread. {facts}"]
+    cells = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
+    page = [f"## {TABLES[name]}", "", *cells, "", f"Means over worlds, in brackets their spread. {facts}"]
     if images:
         tiles = stack([interpolate(part[:12].float(), (128, 128)) for part in images.values()], dim=1)
         grid = make_image_grid(numpy_to_pil(tiles.flatten(0, 1).movedim(1, -1).numpy()), *tiles.shape[:2])

@@ -1,11 +1,8 @@
 """Files and models that commands run on."""
 
-import atexit
 import glob
 import os
 import re
-import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,24 +36,17 @@ def suffixes_of(modality: str) -> frozenset[str]:
 
 
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
-    """The files that words of a command line stand for, in their order.
+    """The files of a modality that words of a command line stand for, in their order.
 
-    A word is the path of a file, of a folder, which stands for the files of the modality in it, a pattern such as
-    "touches/**/*.png", "example:brick", or "-", standard input.
-
-    Args:
-        name: The argument, for the messages.
-        words: As they were typed.
-        modality: "touch", "image" or "audio".
+    A word is the path of a file, of a folder, a pattern such as "touches/**/*.png", or "example:brick". `name` is the
+    argument, for the messages.
     """
     from unitouch_gen.examples import example
     from unitouch_gen.files import check_file, natural
 
     found: list[Path] = []
     for word in words:
-        if word == "-":
-            files = [_standard_input(name)]
-        elif word.startswith("example:"):
+        if word.startswith("example:"):
             files = [example(word.removeprefix("example:"), modality)]
         elif os.path.isdir(word):
             known = suffixes_of(modality)
@@ -71,18 +61,6 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
             raise InvalidInputError(f"`{name}` is {word!r}, where there are no {what}; name another folder or pattern.")
         found += sorted(files, key=natural)
     return found
-
-
-def _standard_input(name: str) -> Path:
-    """A file of what comes in on standard input, which goes when the process ends."""
-    content = sys.stdin.buffer.read()
-    if not content:
-        raise InvalidInputError(f"`{name}` is '-', standard input, which is empty or was read already; name a file.")
-    folder = tempfile.TemporaryDirectory(prefix="unitouch-")
-    atexit.register(folder.cleanup)
-    file = Path(folder.name) / "stdin"
-    file.write_bytes(content)
-    return file
 
 
 # Models ---------------------------------------------------------------------------------------------------------------
@@ -166,9 +144,7 @@ def device_of(name: str) -> Any:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        device = torch.empty(0, device=name).device
+        torch.empty(1, device=name).cpu()  # which meta, a device without numbers, refuses
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise InvalidInputError(f"`--device` is {name!r}, of which torch finds none here; pass cpu or cuda.") from error
-    if device.type == "meta":
-        raise InvalidInputError("`--device` is 'meta', which holds no numbers; pass cpu or cuda, or leave it out.")
-    return device
+        raise InvalidInputError(f"`--device` is {name!r}, which cannot be used here; pass cpu or cuda.") from error
+    return torch.device(name)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Exit, Option, echo
 
 from unitouch_gen.cli.loading import CLASSES, INPUTS, kind_of, load_pipeline
-from unitouch_gen.cli.options import Guidance, Model, is_quiet, print_table
+from unitouch_gen.cli.options import Guidance, Model, check_output, print_table
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
 
 
@@ -21,8 +21,6 @@ def work_precision(
     tolerances: Annotated[str, Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
     guidance_scale: Guidance = None,
     seeds: Annotated[int, Option(min=1, max=1000, help="Noises to start from, for each contact.")] = 4,
-    conditions: Annotated[int, Option(min=1, max=17, help="Contacts of the world that a pipeline is given.")] = 4,
-    repeats: Annotated[int, Option(min=1, max=1000, help="Runs of each point that are timed.")] = 3,
 ) -> None:
     """Charts the error of solvers against their run time.
 
@@ -30,7 +28,6 @@ def work_precision(
     """
     from tqdm import tqdm
 
-    from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
 
@@ -38,27 +35,25 @@ def work_precision(
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
     if problem is not None and (model is not None or guidance_scale is not None):
         raise InvalidInputError("`--model` and `--guidance` are of pipelines, not of an exact problem; leave them out.")
-    check_writable("--output", output / "results.json")
+    check_output([output / "results.json"], overwrite=True)
     known = [name for name in wp.NAMES if pipeline is not None or name != "default"]
     names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
     counts, errors = numbers_of("--steps", steps, int, 1, 1000), numbers_of("--tolerances", tolerances, float, 1e-5, 1)
     points: list[dict[str, Any]] = []
     for name in names:
-        check_choice("--solvers", name, known)
-        values = {"tolerance": errors} if name == "adaptive" else {"steps": counts}
-        points += [{"solver": name, what: value} for what, each in values.items() for value in each]
+        kind, values = ("tolerance", errors) if name == "adaptive" else ("steps", counts)
+        points += [{"solver": check_choice("--solvers", name, known), kind: value} for value in values]
 
     if problem is not None:
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
         name = check_choice("--pipeline", pipeline, CLASSES)
-        pipe = load_pipeline(name, model=model)
-        inputs = wp.world_inputs(INPUTS[name], conditions)
+        pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
         target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale)
         if "default" in names:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up
-    rows = [wp.measure(target, **point, repeats=repeats) for point in tqdm(points, disable=is_quiet(False))]
+    rows = [wp.measure(target, **point) for point in tqdm(points, disable=None)]
     wp.save(output, target, rows)
     echo(f"{target.name}, guidance {target.guidance.scale:g}; the reference's own error is {target.own_error:.1e}")
     best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
@@ -98,10 +93,10 @@ def stability(
     def load(kind: str, dtype: Any) -> Any:
         return load_pipeline(kind, model=model, dtype=str(dtype).removeprefix("torch."))
 
-    table = cases(load, [*CLASSES] if model is None else [kind_of(model)])
-    if only is not None and only not in (names := [case.name for case in table]):
-        raise InvalidInputError(f"Unknown case {only!r}; --list shows them. {did_you_mean(only, names)}".rstrip())
-    table = [case for case in table if only in (None, case.name)]
+    known = {case.name: case for case in cases(load, [*CLASSES] if model is None else [kind_of(model)])}
+    if only is not None and only not in known:
+        raise InvalidInputError(f"Unknown case {only!r}; --list shows them. {did_you_mean(only, known)}".rstrip())
+    table = [*known.values()] if only is None else [known[only]]
     if list_cases:
         print_table(["case", "reason of the bound"], [[case.name, case.reason] for case in table])
         return
@@ -109,7 +104,7 @@ def stability(
     rows, failed = [], 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of extreme input
-        for case in tqdm(table, disable=is_quiet(False), leave=False):
+        for case in tqdm(table, disable=None, leave=False):
             try:
                 value, bound = case.run()
             except Exception as error:  # the other cases still run

@@ -20,7 +20,7 @@ SETTABLE = (
 """Arguments of pipelines' calls that are the same for all pictures of a call."""
 
 FILE = {"exists": True, "dir_okay": False}
-A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns, - or example:NAME"
+A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns or example:NAME"
 
 # Inputs and outputs
 Touches = Annotated[list[str], Argument(help=f"Touch images, or videos: {SEVERAL}.")]
@@ -71,10 +71,13 @@ def value_of(word: str) -> Any:
         return word
 
 
-def check_new(files: Sequence[Path]) -> None:
-    """Refuses to replace files that are there."""
-    for file in filter(os.path.lexists, files):
+def check_output(files: Sequence[Path], overwrite: bool) -> None:
+    """Refuses to replace files that are there, if not asked to, and places that cannot be written to."""
+    from unitouch_gen.files import check_writable
+
+    for file in filter(os.path.lexists, () if overwrite else files):
         raise InvalidInputError(f"`--output` would replace {str(file)!r}; name another place, or pass `--overwrite`.")
+    check_writable("--output", files[0])
 
 
 def is_quiet(as_json: bool) -> bool:

@@ -12,28 +12,20 @@ from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
 
-Fields = dict[str, Any]
-"""Components of a tab, by the arguments of its pipeline's call."""
+Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
 
 def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
-    """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`.
-
-    It fetches nothing from other hosts and has no interface for programs.
-    """
-    tabs = {
-        "touch-to-image": ("To picture", touch_fields),
-        "stylization": ("Style a photo", style_fields),
-        "x-to-touch": ("To touch", any_fields),
-    }
+    """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it asks no other host."""
+    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch"}
+    fields = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields}
     # Uploads and pictures stay on the disk for an hour.
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
         with gradio.Tabs():
-            for kind, (title, fields) in tabs.items():
-                if kind in pipes:
-                    with gradio.Tab(title):
-                        tab(pipes[kind], fields, kind == "touch-to-image")
+            for kind in [kind for kind in titles if kind in pipes]:
+                with gradio.Tab(titles[kind]):
+                    tab(pipes[kind], fields[kind], kind == "touch-to-image")
     system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
     css = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"  # phones
     page.queue(max_size=16, default_concurrency_limit=1).launch(
@@ -101,11 +93,11 @@ def any_fields(pipe: Any) -> Fields:
 
 def upload(modality: str, label: str) -> Any:
     """A file of a modality, with samples."""
+    sources: Any = ["upload", "clipboard"]
     with gradio.Row():
         if modality == "audio":
             part: Any = gradio.Audio(type="filepath", label=label)
         else:
-            sources: Any = ["upload", "clipboard"]
             part = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
         files = [[str(file)] for file in examples(modality).values()]
         gradio.Examples(files, part, label="Samples", api_visibility="private")
@@ -148,12 +140,8 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
         for value in filter(lambda value: isinstance(value, str), given.values()):
             said = said.replace(value, Path(value).name)  # names of uploads, and not where they lie here
         raise gradio.Error(said, duration=None, print_exception=False) from error
-    return output.images, feels_like(pipe, output.encoded), str(output.report), str(seed)
-
-
-def feels_like(pipe: Any, embeddings: torch.Tensor | None) -> str:
-    """Materials of a touch, by its embedding (B, D); nothing where the joint space reads no words."""
-    if embeddings is None or pipe.processor.tokenizer is None:
-        return ""
-    classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor, pipe.embedding_bank)
-    return str(classifier.name(embeddings[:1], "touch")[0])
+    felt = ""
+    if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
+        classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor, pipe.embedding_bank)
+        felt = str(classifier.name(output.encoded[:1], "touch")[0])
+    return output.images, felt, str(output.report), str(seed)

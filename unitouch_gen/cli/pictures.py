@@ -48,7 +48,7 @@ def touch_to_image(
 
 def stylize(
     context: Context,
-    image: Annotated[str, Argument(help="The photo: a file, - or example:NAME.")],
+    image: Annotated[str, Argument(help="The photo: a file or example:NAME.")],
     touch: options.Touches, output: options.Output,
     touch_weight: Annotated[float, Option(min=0, max=1, help="Share of the touch; the photo has the rest.")] = 0.3,
     mix: Annotated[str, Option(help="How touch and photo are mixed: linear, slerp or paper.")] = "linear",
@@ -140,29 +140,22 @@ def stem_of(value: Path | str) -> str:
 
 def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) -> list[Picture]:
     """The pictures of rows of inputs and the names of their files; refuses what cannot be written."""
-    from unitouch_gen.files import check_writable
-
     given = context.params
     output, images, candidates = Path(given["output"]), given["num_images_per_prompt"], given.get("num_candidates", 1)
     each = [(inputs, stem, number) for inputs, stem in rows for number in range(images)]
     stems = unique([f"{stem}-{number + 1}" if images > 1 else stem for _, stem, number in each])
     files = [output / f"{stem}.png" for stem in stems]
     if output.suffix and not os.path.isdir(output):
-        if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp"):
-            raise InvalidInputError(f"`--output` is {str(output)!r}; pictures are .png, .jpg or .webp.")
-        if len(files) > 1:
-            raise InvalidInputError(f"`--output` is the file {str(output)!r} for {len(files)} pictures; name a folder.")
+        if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(files) > 1:
+            wanted = "name a folder, or for one a .png, .jpg or .webp."
+            raise InvalidInputError(f"`--output` is {str(output)!r} for {len(files)} pictures; {wanted}")
         files = [output]
     read = {os.path.realpath(value) for inputs, _ in rows for value in inputs.values() if isinstance(value, Path)}
     if read & {os.path.realpath(file) for file in files}:
         raise InvalidInputError(f"`--output` is {str(output)!r}, where an input would be replaced; name another place.")
-    if not given["overwrite"]:
-        options.check_new(files)
-    check_writable("--output", files[0])
-    return [
-        Picture(inputs, file, given["seed"] + number * candidates)
-        for (inputs, _, number), file in zip(each, files, strict=True)
-    ]
+    options.check_output(files, given["overwrite"])
+    seeds = [given["seed"] + number * candidates for _, _, number in each]
+    return [Picture(inputs, *place) for (inputs, _, _), *place in zip(each, files, seeds, strict=True)]
 
 
 def unique(names: Sequence[str]) -> list[str]:

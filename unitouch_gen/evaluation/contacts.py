@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from unitouch_gen.evaluation.controls import relief_statistics, statistics, untrained_like
 from unitouch_gen.evaluation.zero_shot import text_embeddings
@@ -14,8 +15,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 
-SPLITS = ("train", "val", "test")
-"""What probes are fitted to, what their strength is chosen by, and what figures are of."""
+SPLITS = ("train", "val", "test")  # that probes are fitted to, that their strength is chosen by, and that is measured
 
 
 @dataclass
@@ -57,8 +57,7 @@ class Contacts:
         return self.labels.get("material", torch.full_like(self.objects, -1))
 
 
-Splits = Mapping[str, Contacts]
-"""Contacts by some of `SPLITS`."""
+Splits = Mapping[str, Contacts]  # by some of `SPLITS`
 
 
 def float_pixels(images: Any) -> Tensor:
@@ -119,7 +118,7 @@ def image_embeddings(model: UniTouchModel, modality: str, images: Any, sensors: 
     return in_batches(len(images), encode)
 
 
-def in_batches(count: int, encode: Callable[[slice], Any]) -> Tensor:
+def in_batches(count: int, encode: Callable[[slice], Any], size: int = 128) -> Tensor:
     """Float rows of what `encode` makes of slices of `count` samples."""
-    parts = (encode(slice(start, start + 128)) for start in range(0, count, 128))
-    return torch.cat([torch.as_tensor(part).float().cpu() for part in parts])
+    starts = tqdm(range(0, count, size), mininterval=5.0, leave=False, disable=None)
+    return torch.cat([torch.as_tensor(encode(slice(start, start + size))).float().cpu() for start in starts])

@@ -11,8 +11,7 @@ from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import relief
 
-Figures = dict[str, float]
-"""Measured values by name."""
+Figures = dict[str, float]  # measured values by name
 
 
 def with_controls(measure: Callable[[Tensor], Figures], columns: Mapping[str, Tensor]) -> dict[str, Figures]:
@@ -35,12 +34,9 @@ def others(count: int) -> Tensor:
 
 
 def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> Tensor:
-    """The mean of each sample's class.
+    """The mean of each sample's class, of values (N, ...) with labels from 0, int64 (N,).
 
-    Args:
-        values: (N, ...).
-        labels: Classes of these, int64 (N,) from 0.
-        asked: Classes (M,) of other samples, to give the means of; a mean that holds a sample itself agrees with it.
+    `asked` are classes (M,) of other samples, to give the means of: a mean that holds a sample itself agrees with it.
     """
     asked = labels if asked is None else asked
     member = F.one_hot(labels, int(max(labels.max(), asked.max())) + 1).to(values)  # (N, classes)
@@ -51,11 +47,7 @@ def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> 
 def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
     """Plain statistics of touches' difference to the gel at rest: of gradients, of bands, and of colours.
 
-    Args:
-        differences: N of (H, W, 3), in units of 1/255.
-
-    Returns:
-        float64 (N, 22).
+    Differences are N of (H, W, 3), in units of 1/255; statistics are float64 (N, 22).
     """
     rows = []
     for difference in differences:

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from unitouch_gen.evaluation.contacts import Contacts, Splits, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import Figures, class_means, with_controls
@@ -17,9 +16,7 @@ from unitouch_gen.evaluation.metrics import correlated, cosines, frechet_distanc
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.world import ATTRIBUTES
 
-Classifiers = Mapping[str, ContactClassifier]
-"""Of the modalities "image" and "touch"."""
-
+Classifiers = Mapping[str, ContactClassifier]  # of "image" and "touch"
 MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 
 
@@ -29,14 +26,8 @@ def touch_to_image_table(
     """Table 5: measures of pictures of the test split's touches, with their controls; and K of each, (K, 3, H, W).
 
     Controls are pictures of the mean touch of a class and of another contact, and the real picture of the nearest touch
-    of the training split. The ceiling is the real picture, which the world shows under another lamp.
-
-    Args:
-        pipe: A touch-to-image pipeline.
-        splits: "train", which the measures are fitted to, and "test", with pictures and the features of `embed`.
-        classifiers: Which judge the pictures.
-        each: Contacts of each material that pictures are made of.
-        seed: Of the noise.
+    of the training split. The ceiling is the real picture, which the world shows under another lamp. Measures are
+    fitted to the split "train", and `each` contacts of each material of "test" are drawn.
     """
     train, test = splits["train"], splits["test"]
     rows = some(test, each)
@@ -85,23 +76,21 @@ def some(contacts: Contacts, each: int) -> Tensor:
 
 def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) -> Tensor:
     """An image (N, 3, H, W) for each of N inputs, arguments of the pipeline's call beside its options, in batches."""
-    images = []
-    for start in tqdm(range(0, len(next(iter(inputs.values()))), 64), desc="images", mininterval=5.0, leave=False):
-        part = {name: values[start : start + 64] for name, values in inputs.items()}
-        generator = torch.Generator().manual_seed(1_000 * seed + start // 64)
-        images.append(pipe(**part, **options, generator=generator, output_type="pt").images.float().cpu())
-    return torch.cat(images)
+
+    def draw(rows: slice) -> Tensor:
+        part = {name: values[rows] for name, values in inputs.items()}
+        generator = torch.Generator().manual_seed(1_000 * seed + rows.start // 64)
+        return pipe(**part, **options, generator=generator, output_type="pt").images
+
+    return in_batches(len(next(iter(inputs.values()))), draw, 64)
 
 
 def beside_class_means(
     encode: Callable[..., Tensor], name: str, inputs: Any, contacts: Contacts, rows: Tensor
 ) -> dict[str, Tensor]:
     """Embeddings of some rows, and if all are labelled the means over their classes, each as long as the row's own."""
-
-    def encoded(part: slice) -> Tensor:
-        return encode(**{name: inputs[part] if name in ("text", "audio") else float_pixels(inputs[part])})
-
-    embeds = in_batches(len(inputs), encoded)
+    read: Any = float_pixels if name in ("image", "touch") else lambda values: values
+    embeds = in_batches(len(inputs), lambda part: encode(**{name: read(inputs[part])}))
     if bool((contacts.material < 0).any()):
         return {"value": embeds[rows]}
     means = F.normalize(class_means(F.normalize(embeds, dim=-1), contacts.material), dim=-1)

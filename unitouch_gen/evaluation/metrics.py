@@ -27,15 +27,13 @@ def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
 def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | None = None, *, size: int = 64) -> float:
     """Expected share of queries that are nearest, by cosine, to their own sample among `size`; chance is 1 / size.
 
-    The other `size` - 1 are of the same class. The expectation is over all draws of them, so it has no seed. Samples
-    that are equally near are as likely to come first.
+    The other `size` - 1 are of the same class, of which none may have fewer. The expectation is over all draws of them,
+    so it has no seed. Samples that are equally near are as likely to come first.
 
     Args:
-        queries: (Q, D).
-        gallery: (N, D).
+        queries, gallery: (Q, D) and (N, D).
         labels: Of the gallery, int64 (N,).
         rows: Row of each query's own sample in the gallery, int64 (Q,); 0, 1, 2 and so on if left out.
-        size: Samples that a query is compared to, its own among them; no class asked about may have fewer.
     """
     rows = torch.arange(len(queries)) if rows is None else rows
     cosine = cosines(queries, gallery)
@@ -59,17 +57,15 @@ def mean_average_precision(queries: Tensor, gallery: Tensor, objects: Tensor) ->
     return float(label_ranking_average_precision_score(relevant, cosines(queries, gallery).cpu().numpy()))
 
 
-CORRELATED = {"CCA": CCA, "PLSCA": PLSCanonical}
-"""Canonical correlation analysis (Hotelling, 1936) and partial least squares (Wegelin, 2000)."""
+CORRELATED = {"CCA": CCA, "PLSCA": PLSCanonical}  # Hotelling, 1936; Wegelin, 2000
 
 
 def correlated(
     method: str, pairs: tuple[Tensor, Tensor], queries: Tensor, gallery: Tensor, components: int = 10
 ) -> tuple[Tensor, Tensor]:
-    """Queries (Q, D) and gallery (N, E) in the space in which pairs (M, D) and (M, E) correlate most.
+    """Queries (Q, D) and gallery (N, E) in the space in which pairs (M, D) and (M, E) correlate most, K-dimensional.
 
-    Returns:
-        (Q, K) and (N, K), whose components have unit variance over the pairs, so that cosines compare the two.
+    Its components have unit variance over the pairs, so that cosines compare the two.
     """
     one, other, asked, stored = (part.double().cpu().numpy() for part in (*pairs, queries, gallery))
     fitted = CORRELATED[method](min(components, one.shape[1], other.shape[1], len(one) - 1), max_iter=500)

@@ -13,10 +13,8 @@ from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits
 from unitouch_gen.evaluation.controls import Figures, class_means, others
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 
-Embed = Callable[[Sequence[str]], Tensor]
-"""Unit embeddings (N, D) of texts."""
-
-PROBED = {
+Embed = Callable[[Sequence[str]], Tensor]  # unit embeddings (N, D) of texts
+PROBED = {  # rows of linear probes, by features
     "gel": "untouched gel, probe",
     "statistics": "plain statistics, probe",
     "relief": "statistics of the relief, probe",
@@ -24,14 +22,8 @@ PROBED = {
     "supervised": "supervised classifier of touches, probe",
     "touch": "touch encoder, probe",
 }
-"""Rows of linear probes, by features."""
-
-ASKED = {"touch": "touch encoder, zero-shot", "image": "picture of the contact, zero-shot"}
-"""Rows of zero-shot classification, by features."""
-
-GRASP_PROMPTS = {"dropped": "the object is falling on the ground", "lifted": "the object is lifted in the air"}
-"""Section 4.2 of the paper; by the name of the class."""
-
+ASKED = {"touch": "touch encoder, zero-shot", "image": "picture of the contact, zero-shot"}  # rows, by features
+GRASP_PROMPTS = {"dropped": "the object is falling on the ground", "lifted": "the object is lifted in the air"}  # 4.2
 TEMPLATES = ("this is an image of {}", "this is a touch image of {}", "this looks like {}", "this feels like {}",
              "image of {}", "touch of {}")  # fmt: skip
 """The prompts of Table 7."""

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 PROMPTS = {**dict.fromkeys(("image", "audio", "text"), "this looks like {}"), "touch": "this feels like {}"}
 """The template of each modality; that of touch is the paper's (Table 7)."""
 
-BY_PICTURES = "touch by pictures"
-"""Name of the temperature of touches that are named by a bank of pictures."""
+BY_PICTURES = "touch by pictures"  # the temperature of touches that are named by a bank of pictures
 
 
 @torch.no_grad()
@@ -89,11 +88,8 @@ class ZeroShotTouchClassifier:
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
         width = model.config.projection_dim
-        if embedding_bank is not None and embedding_bank.config["embedding_dim"] != width:
-            raise InvalidInputError(
-                f"`embedding_bank` has embeddings of width {embedding_bank.config['embedding_dim']}, the model of "
-                f"{width}; pass one of the model's own images."
-            )
+        if embedding_bank is not None and (found := embedding_bank.config["embedding_dim"]) != width:
+            raise InvalidInputError(f"`embedding_bank` has embeddings of width {found}, the model of {width}.")
         self.model, self.processor, self.embedding_bank = model, processor, embedding_bank
 
     @torch.no_grad()
@@ -161,8 +157,7 @@ class ZeroShotTouchClassifier:
     def scores(
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
     ) -> Tensor:
-        """What probabilities are a softmax of, (B, labels): cosines with labels, or of touches, with a bank, the
-        logarithms of sum_k p(picture k | touch) p(label | picture k). See `name` for the arguments."""
+        """What probabilities are a softmax of, (B, labels): cosines, or the bank's logarithms of p(label | touch)."""
         texts = [(template or PROMPTS[modality]).format(label) for label in labels]
         classes, bank = text_embeddings(self.model, self.processor, texts), self.embedding_bank
         if modality != "touch" or bank is None:
