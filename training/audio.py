@@ -46,7 +46,6 @@ def watch_retrieval(model: UniTouchModel, heldout: list[Rendered]) -> dict[str, 
 
 
 def main(stage: Stage) -> None:
-    stage.read(Recipe)
     model = stage.joint_space("image")
     splits = stage.splits("image", "audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=stage.image_embeddings(model, splits))
@@ -57,4 +56,4 @@ def main(stage: Stage) -> None:
 
 
 if __name__ == "__main__":
-    run("audio", main)
+    run("audio", Recipe, main)

@@ -119,8 +119,8 @@ def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, heldout:
 
 
 def main(stage: Stage) -> None:
-    recipe, init = stage.read(ImageTextRecipe), stage.folders.get("init")
-    config, objective = build("model", UniTouchConfig, recipe.model), recipe.objective
+    recipe: ImageTextRecipe = stage.recipe
+    init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
     build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
@@ -155,4 +155,4 @@ def main(stage: Stage) -> None:
 
 
 if __name__ == "__main__":
-    run("image_text", main)
+    run("image_text", ImageTextRecipe, main)

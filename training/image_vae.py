@@ -108,7 +108,7 @@ def read_autoencoder(folder: Path) -> Autoencoder:
 
 
 def main(stage: Stage, modality: str = "image") -> None:
-    recipe = stage.read(AutoencoderRecipe)
+    recipe: AutoencoderRecipe = stage.recipe
     vae, crop = make_autoencoder(recipe.model), recipe.augment.crop
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
@@ -126,4 +126,4 @@ def main(stage: Stage, modality: str = "image") -> None:
 
 
 if __name__ == "__main__":
-    run("image_vae", main)
+    run("image_vae", AutoencoderRecipe, main)

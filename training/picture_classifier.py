@@ -100,7 +100,7 @@ def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()
 
 
 def main(stage: Stage, modality: str = "image") -> None:
-    recipe = stage.read(ClassifierRecipe)
+    recipe: ClassifierRecipe = stage.recipe
     labels = dict(enumerate(material_names(stage.sources)))
     numbers = {name: number for number, name in labels.items()}
     config = build("model", ResNetConfig, recipe.model, id2label=labels, label2id=numbers)
@@ -120,4 +120,4 @@ def main(stage: Stage, modality: str = "image") -> None:
 
 
 if __name__ == "__main__":
-    run("picture_classifier", main)
+    run("picture_classifier", ClassifierRecipe, main)

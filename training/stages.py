@@ -29,8 +29,8 @@ from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings
-from unitouch_gen.training.recipe import Arguments, Settings, SettingsKind, build, overridden, read, read_recipe
+from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
+from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 
 STAGES: dict[str, dict[str, str]] = {
@@ -60,11 +60,15 @@ class Recipe(Settings):
 
 
 class Stage:
-    """One call of a stage's command, with its options as arguments; `folders` are the models that were given."""
+    """One call of a stage's command, with its options as arguments; `folders` are the models that were given.
+
+    `recipe` is read as settings of a `kind`; `given` is what was read, for checkpoints and the record.
+    """
 
     def __init__(
         self,
         name: str,
+        kind: type[Recipe],
         *,
         recipe: Annotated[str | None, Option(help="A YAML file, or a name in training/recipes.")] = None,
         overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
@@ -86,9 +90,9 @@ class Stage:
                 "`--resume` to go on with it, remove it, or name another output."
             )
         changes = overrides or ()
-        self.recipe = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
-        self.trainer = read(TrainerConfig, self.recipe.get("trainer"), "trainer")
-        self.data = read(DataConfig, self.recipe.get("data"), "data")
+        self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
+        self.recipe: Any = read(kind, self.given)
+        self.trainer, self.data = self.recipe.trainer, self.recipe.data
         folders = {"joint": joint, "vae": vae, "init": init}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
         needs = {*STAGES[name]}
@@ -108,10 +112,6 @@ class Stage:
             check_writable(option, folder / "record.json")
         if not self.processes.is_main_process:
             self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
-
-    def read(self, kind: type[SettingsKind]) -> SettingsKind:
-        """The whole recipe, as settings of a stage."""
-        return read(kind, self.recipe)
 
     @cached_property
     def processor(self) -> UniTouchProcessor:
@@ -176,7 +176,7 @@ class Stage:
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
-        begun = {"inputs": self.inputs, "recipe": self.recipe}
+        begun = {"inputs": self.inputs, "recipe": self.given}
         trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun, watch)
         if self.resume:
             trainer.resume()
@@ -189,7 +189,7 @@ class Stage:
         record: dict[str, Any] = {
             "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
             "inputs": self.inputs, "trainer": self.trainer.model_dump(),
-            "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
+            "recipe": {key: value for key, value in self.given.items() if key != "trainer"},
             "sets": [source.summary for source in self.sources],
             **figures,
         }  # fmt: skip
@@ -238,15 +238,15 @@ def save_modalities(
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
 
 
-def run(name: str, main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
+def run(name: str, kind: type[Recipe], main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
     """Runs a stage by its command line, or by words in place of those that the process was started with."""
 
     def command(**options: Any) -> None:
-        stage = Stage(name, **options)
+        stage = Stage(name, kind, **options)
         torch.manual_seed(stage.trainer.seed)
         main(stage)
 
-    command.__signature__ = signature(partial(Stage, name))  # type: ignore[attr-defined]
+    command.__signature__ = signature(partial(Stage, name, kind))  # type: ignore[attr-defined]
     run_command(name, command, words)
 
 

@@ -183,7 +183,7 @@ def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, heldout: list[R
 
 
 def main(stage: Stage) -> None:
-    recipe = stage.read(TouchRecipe)
+    recipe: TouchRecipe = stage.recipe
     stage.check_drawn(*recipe.objective.pairs)
     share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     model = stage.joint_space("image")
@@ -212,4 +212,4 @@ def main(stage: Stage) -> None:
 
 
 if __name__ == "__main__":
-    run("touch", main)
+    run("touch", TouchRecipe, main)

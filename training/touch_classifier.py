@@ -11,4 +11,4 @@ from unitouch_gen.training.stages import run
 main = partial(picture_classifier.main, modality="touch")
 
 if __name__ == "__main__":
-    run("touch_classifier", main)
+    run("touch_classifier", picture_classifier.ClassifierRecipe, main)

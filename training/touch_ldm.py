@@ -73,20 +73,16 @@ class TouchDiffusionObjective(nn.Module):
         self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        condition, latents = self._condition(batch["image_embeds"].float()), batch["latents"].float()
+        embeds, latents, settings = batch["image_embeds"].float(), batch["latents"].float(), self.settings
+        (count, width), device = embeds.shape, embeds.device
+        size = settings.condition_noise * torch.rand(count, 1, device=device)
+        size = size * (torch.rand(count, 1, device=device) < settings.noisy_share)
+        noisy = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
+        kept = torch.rand(count, 1, device=device) >= settings.condition_dropout
+        condition = match_norm(noisy, self.embedding_norm) * kept
         extra = None if self.backgrounds is None else self.backgrounds[batch["background"].cpu()].to(latents)
         conditions = {"encoder_hidden_states": condition[:, None], "class_labels": batch["sensor"]}
-        return denoising_losses(self.trained, self.scheduler, latents, self.settings.snr_gamma, extra, **conditions)
-
-    def _condition(self, embeds: Tensor) -> Tensor:
-        """Embeddings (B, D) of one norm, some perturbed, some dropped."""
-        count, width = embeds.shape
-        device = embeds.device
-        size = self.settings.condition_noise * torch.rand(count, 1, device=device)
-        size = size * (torch.rand(count, 1, device=device) < self.settings.noisy_share)
-        unit = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
-        kept = torch.rand(count, 1, device=device) >= self.settings.condition_dropout
-        return match_norm(unit, self.embedding_norm) * kept
+        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, extra, **conditions)
 
 
 def class_labels(splits: Sequence[Rendered], sensors: Sequence[str]) -> np.ndarray:
@@ -102,7 +98,7 @@ def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
 
 
 def main(stage: Stage) -> None:
-    recipe = stage.read(TouchDiffusionRecipe)
+    recipe: TouchDiffusionRecipe = stage.recipe
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
@@ -159,4 +155,4 @@ def main(stage: Stage) -> None:
 
 
 if __name__ == "__main__":
-    run("touch_ldm", main)
+    run("touch_ldm", TouchDiffusionRecipe, main)

@@ -11,4 +11,4 @@ from unitouch_gen.training.stages import run
 main = partial(image_vae.main, modality="touch")
 
 if __name__ == "__main__":
-    run("touch_vae", main)
+    run("touch_vae", image_vae.AutoencoderRecipe, main)

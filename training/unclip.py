@@ -70,19 +70,18 @@ class UnclipObjective(nn.Module):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         latents, embeds = batch["latents"].float(), batch["image_embeds"]
-        kept = torch.rand(len(embeds), device=embeds.device) >= self.settings.condition_dropout
-        labels = self._noised(embeds) * kept[:, None]
-        hidden = self._prompts(batch["index"].tolist(), kept.tolist(), embeds.device)
-        conditions = {"encoder_hidden_states": hidden, "class_labels": labels}
-        return denoising_losses(self.trained, self.scheduler, latents, self.settings.snr_gamma, **conditions)
-
-    def _noised(self, embeds: Tensor) -> Tensor:
-        """Class labels (B, 2 D): some at level 0, where a picture's own embedding is used, the others at any level."""
-        count, device = len(embeds), embeds.device
-        noised = torch.rand(count, device=device) >= self.settings.clean_share
+        settings, count, device = self.settings, len(embeds), embeds.device
+        kept = torch.rand(count, device=device) >= settings.condition_dropout
+        # Some are at level 0, where a picture's own embedding is used, the others at any level.
+        noised = torch.rand(count, device=device) >= settings.clean_share
         level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
-        gain = self.settings.gain + (1.0 - self.settings.gain) * torch.rand(count, 1, device=device)
-        return noise_embeddings(gain * embeds, level, torch.randn_like(embeds), self.frozen[0], self.noising)
+        gain = settings.gain + (1.0 - settings.gain) * torch.rand(count, 1, device=device)
+        labels = noise_embeddings(
+            gain * embeds, level, torch.randn_like(embeds), self.frozen[0], self.noising
+        )  # (B, 2 D)
+        hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
+        conditions = {"encoder_hidden_states": hidden, "class_labels": labels * kept[:, None]}
+        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
 
     @torch.no_grad()
     def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
@@ -106,7 +105,7 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 
 
 def main(stage: Stage) -> None:
-    recipe = stage.read(UnclipRecipe)
+    recipe: UnclipRecipe = stage.recipe
     joint = stage.joint_space("image", "text")
     vae = read_autoencoder(stage.folders["vae"])
     unet = stage.unet(recipe.model)
@@ -126,4 +125,4 @@ def main(stage: Stage) -> None:
 
 
 if __name__ == "__main__":
-    run("unclip", main)
+    run("unclip", UnclipRecipe, main)

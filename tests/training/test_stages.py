@@ -13,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from tests.training.conftest import AUDIO, SPACE
+from tests.training.test_recipe import KINDS
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
@@ -62,7 +63,8 @@ def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None
     given = [word for option, before in STAGES[name].items() for word in (f"--{option}", str(runs / before / "model"))]
     overrides = [word for setting in (*SHORT, *SETTINGS[name]) for word in ("--set", setting)]
     places = ["--output", str(runs / (output or name)), "--cache", str(runs / "cache")]
-    run(name, import_module(f"unitouch_gen.training.{name}").main, [*given, *overrides, *places, *words])
+    main = import_module(f"unitouch_gen.training.{name}").main
+    run(name, KINDS[name], main, [*given, *overrides, *places, *words])
 
 
 @pytest.fixture(scope="module")
@@ -180,12 +182,12 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
     place.mkdir(parents=True)
     (place / "progress.json").write_text(json.dumps({"step": 1, "seconds": 1.0, "recipe": recipe, "inputs": inputs}))
     given = {"joint": Path(joint), "output": tmp_path, "resume": True}
-    found = Stage("touch", overrides=["trainer.steps=3"], **given)
-    assert (found.recipe["sampler"]["sigma"], found.trainer.steps) == (0.5, 3)
+    found = Stage("touch", KINDS["touch"], overrides=["trainer.steps=3"], **given)
+    assert (found.recipe.sampler.sigma, found.trainer.steps) == (0.5, 3)
     file = next(Path(joint).rglob("*.safetensors"))
     save_file({"weight": torch.ones(2)}, file)
     with pytest.raises(InvalidInputError, match=r"was built on other weights than --joint"):
-        Stage("touch", **given)
+        Stage("touch", KINDS["touch"], **given)
 
 
 @pytest.mark.parametrize(
@@ -212,6 +214,6 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
     monkeypatch.chdir(tmp_path / "here")
     main = import_module(f"unitouch_gen.training.{name}").main
     with pytest.raises(SystemExit, match="2"):
-        run(name, main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
+        run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
     (error,) = capsys.readouterr().err.splitlines()
     assert message in error and list((tmp_path / "here").iterdir()) == []

@@ -159,8 +159,8 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
                 f"data.sets=[{{path: {folder}, split: object}}]",
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
     words = ["--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
-    main = import_module("unitouch_gen.training.touch").main
-    run("touch", main, [*words, *(part for one in settings for part in ("--set", one))])
+    module = import_module("unitouch_gen.training.touch")
+    run("touch", module.TouchRecipe, module.main, [*words, *(part for one in settings for part in ("--set", one))])
     assert json.loads((tmp_path / "touch" / "record.json").read_text())["sets"] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))
