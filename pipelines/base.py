@@ -46,7 +46,7 @@ from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
-from unitouch_gen.sampling import Guidance, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
+from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
 
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
@@ -253,6 +253,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         report: RunReport,
         init: Tensor | None = None,
         extra_channels: Tensor | None = None,
+        wrap: Callable[[Network], Network] | None = None,
     ) -> Tensor:
         """Noise -> latents (B n, C, h, w) in float32.
 
@@ -260,6 +261,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             hidden_states, class_labels: The UNet's conditioning; with guidance the unconditional half first.
             init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
             extra_channels: Additional input channels (B n, C', h, w), the same in both halves.
+            wrap: Changes what the network predicts.
         """
         device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
@@ -307,7 +309,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         with self.progress_bar(total=total) as bar:
             result = sample(
-                network,
+                network if wrap is None else wrap(network),
                 noise.to(device),
                 settings.steps,
                 report,

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical, mix_to_norm
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.conditioning import apply_strength, mix_linear, mix_to_norm
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
     MAX_IMAGES,
@@ -22,9 +23,51 @@ from unitouch_gen.pipelines.base import (
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
-from unitouch_gen.sampling import RunReport
+from unitouch_gen.sampling import Network, RunReport
+from unitouch_gen.schedule import NoiseSchedule, to_denoised
 
-MIXES = {"linear": mix_to_norm, "slerp": mix_spherical, "paper": mix_linear}
+MIXES = {"linear": mix_to_norm, "paper": mix_linear}
+
+
+class LayoutHold:
+    """Holds the layout of photos while a network denoises, as ILVR does (Choi et al., 2021, Equation 8).
+
+    The coarse part F of what the network predicts of the clean latents becomes that of the photo's latents:
+    D' = D + F(photo - D). As it is the denoiser that changes, every solver, adaptive steps and guidance run as they are.
+
+    Args:
+        photo: Latents (B, C, h, w).
+        cells: F averages over a grid of so many cells along the shorter side, and interpolates between them.
+        keep_colours: Whether the mean of each channel is held, too.
+        schedule, prediction_type: Of the network.
+    """
+
+    def __init__(
+        self, photo: Tensor, cells: int, keep_colours: bool, schedule: NoiseSchedule, prediction_type: str
+    ):
+        self.photo, self.keep_colours = photo.float(), keep_colours
+        share = min(cells / min(photo.shape[-2:]), 1.0)
+        self.grid = [max(round(share * side), 1) for side in photo.shape[-2:]]
+        self.schedule, self.prediction_type = schedule, prediction_type
+
+    def coarse(self, values: Tensor) -> Tensor:
+        """F: the part of (B, C, h, w) that is held."""
+        size = values.shape[-2:]
+        cells = F.interpolate(values, self.grid, mode="bilinear", antialias=True)
+        smooth = F.interpolate(cells, size, mode="bicubic")
+        return smooth if self.keep_colours else smooth - smooth.mean(dim=(2, 3), keepdim=True)
+
+    def __call__(self, network: Network) -> Network:
+        """The network with D' in place of D; states (B or 2 B, C, h, w)."""
+
+        def held(z: Tensor, timestep: Tensor) -> Tensor:
+            prediction, sigma = network(z, timestep).float(), self.schedule.sigma(timestep.cpu()).item()
+            denoised = to_denoised(prediction, z, sigma, self.prediction_type)
+            slope = to_denoised(torch.ones(()), torch.zeros(()), sigma, self.prediction_type).item()  # dD / dprediction
+            photo = self.photo.repeat(len(z) // len(self.photo), 1, 1, 1)
+            return prediction + self.coarse(photo - denoised) / slope
+
+        return held
 
 
 @dataclass(frozen=True)
@@ -39,7 +82,7 @@ class Mixture:
 
 
 class TactileStylizationPipeline(TouchToImagePipeline):
-    """Restyles photos by touches: the same unCLIP model, on a mix of both embeddings.
+    """Restyles photos by touches: the same unCLIP model, on a mix of both embeddings, holding the photo's layout.
 
     See `TouchToImagePipeline` for the components. `default_strength` is not used here.
     """
@@ -50,8 +93,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     def __call__(  # type: ignore[override]
         self,
         image: ImageInput = None, touch: ImageInput = None, prompt: str | list[str] | None = None,
-        touch_weight: float | Sequence[float] = 0.3, image_weight: float | None = None, mix: str = "linear",
-        init_strength: float = 0.65,
+        touch_weight: float | Sequence[float] | None = None, image_weight: float | None = None, mix: str = "linear",
+        layout: int | None = 12, keep_colours: bool = False, init_strength: float = 1.0,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
@@ -74,12 +117,16 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             touch: One touch image or several, likewise. Several photos and touches are paired; one of either goes with
                 all of the other.
             prompt: One prompt, or one for each picture; default "high quality".
-            touch_weight, image_weight: Weights of the embeddings, normalised to a sum of 1 (paper: 0.3 and 0.7).
-                `image_weight` defaults to the rest. A list of touch weights mixes all touches into each picture.
-            mix: "linear", sum_i w_i e_i rescaled to the norm of image embeddings, as in X-to-touch; "slerp", along the
-                sphere; or "paper", the plain sum, which is shorter the more its parts differ.
+            touch_weight, image_weight: Weights of the embeddings, normalised to a sum of 1. `touch_weight` defaults to
+                0.7, and without a `layout` to the paper's 0.3; `image_weight` to the rest. A list of touch weights
+                mixes all touches into each picture.
+            mix: "linear", sum_i w_i e_i rescaled to the norm of image embeddings, as in X-to-touch; or "paper", the
+                plain sum, which is shorter the more its parts differ.
+            layout: The photo's layout is held on a grid of so many cells along the picture's shorter side, from 2:
+                more keep more of the photo, fewer show more of the touch. `None` holds nothing, as in the paper.
+            keep_colours: Whether the mean colour stays that of the photo, too, where a layout is held.
             init_strength: Share of the steps to run from the photo's latents (img2img strength), from near 0 (photo) to
-                1 (from noise alone, as in the paper). With a `tolerance`: the share of the Karras spacing.
+                1 (from noise alone). With a `tolerance`: the share of the Karras spacing.
             strength: Factor on the mixed embedding, >= 0 (paper: 1).
             bridge: See there; touch embeddings are bridged before the mix.
             sensor: Sensor that took the touches: a name, one for each, or `None` to retrieve it.
@@ -89,12 +136,20 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
             >>> pipe = unitouch_gen.tiny("stylization")
             >>> pipe("photo.jpg", unitouch_gen.example("brick")).images[0].save("brick_photo.png")
-            >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
+            >>> pipe("photo.jpg", "brick.png", layout=None)  # as in the paper
+            >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.5, 0.2])  # two touches into one picture
         """
         # 1. Check inputs, before any network runs
         strength = check_number("strength", strength, 0.0, MAX_SCALE)
         check_choice("mix", mix, MIXES)
         check_number("init_strength", init_strength, 0.0, 1.0)
+        schedule = None
+        if layout is not None:
+            check_integer("layout", layout, 2)
+            schedule = NoiseSchedule.of(self.scheduler)
+        check_kind("keep_colours", keep_colours, bool)
+        if touch_weight is None:
+            touch_weight = 0.3 if layout is None else 0.7
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         mixture = self._check_mixture(image, touch, image_weight, touch_weight, sensor, background)
         batch_size = mixture.batch_size
@@ -119,14 +174,18 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             embeds = self._mixed(mixture, mix, strength, bridge, report, throw)
 
         # 3. Encode the photo's own latents
-        init = None
-        if init_strength < 1.0:
+        photo = None
+        if init_strength < 1.0 or layout is not None:
             with report.stage("photo latents"):
-                init = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
-                init = init.repeat_interleave(settings.repeats, dim=0)
+                photo = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
+                photo = photo.repeat_interleave(settings.repeats, dim=0)
 
         # 4. Generate from the mixed embedding
-        images = self._generate(settings, embeds, noise_level, prompts, report, init)
+        hold = None
+        if schedule is not None:
+            hold = LayoutHold(photo, layout, keep_colours, schedule, self.scheduler.config.prediction_type)
+        init = photo if init_strength < 1.0 else None
+        images = self._generate(settings, embeds, noise_level, prompts, report, init, hold)
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 
     def _mixed(

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import torch
@@ -46,7 +46,7 @@ from unitouch_gen.pipelines.base import (
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip
-from unitouch_gen.sampling import Guidance, RunReport
+from unitouch_gen.sampling import Guidance, Network, RunReport
 
 
 class TouchToImagePipeline(UniTouchPipeline):
@@ -243,6 +243,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         prompts: list[list[str] | Tensor],
         report: RunReport,
         init: Tensor | None = None,
+        wrap: Callable[[Network], Network] | None = None,
     ) -> Any:
         """Generates pictures from un-noised embeddings (B, D); see `_check_prompts` and `_denoise`."""
         # 1. Encode the prompts
@@ -259,7 +260,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         # 3. Denoise
         with report.stage("denoising"):
-            latents = self._denoise(settings, hidden_states, labels, report, init)
+            latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
 
         # 4. Decode the finite samples
         with report.stage("decoding"):

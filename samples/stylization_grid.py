@@ -2,7 +2,7 @@
 
 python samples/stylization_grid.py
 python samples/stylization_grid.py --output samples/pictures/stylization.png    # the README's
-python samples/stylization_grid.py --photos mine.jpg --touches a.png b.png --touch-weight 0.5 --init-strength 0.7
+python samples/stylization_grid.py --photos mine.jpg --touches a.png b.png --touch-weight 0.5 --layout 8
 """
 
 import argparse
@@ -22,9 +22,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/stylization.png"))
     parser.add_argument("--photos", type=Path, nargs="+", default=sorted((INPUTS / "photos").glob("*.png")))
     parser.add_argument("--touches", type=Path, nargs="+", default=sorted(INPUTS.glob("*.png"))[:5])
-    parser.add_argument("--touch-weight", type=float, default=0.55, help="the paper uses 0.3, which is subtle here")
-    parser.add_argument("--mix", default="slerp", choices=("linear", "slerp", "paper"))
-    parser.add_argument("--init-strength", type=float, default=0.65, help="how much of the photo's layout goes")
+    parser.add_argument("--touch-weight", type=float, default=0.7, help="share of the touch")
+    parser.add_argument("--layout", type=int, default=12, help="cells along a side of the grid on which the photo is held")
     arguments = parser.parse_args()
 
     pipe = unitouch_gen.tiny("stylization")
@@ -34,8 +33,7 @@ def main() -> None:
             photo,
             arguments.touches,
             touch_weight=arguments.touch_weight,
-            mix=arguments.mix,
-            init_strength=arguments.init_strength,
+            layout=arguments.layout,
             # The same noise in every column, so that the touch alone makes the difference.
             generator=[torch.Generator().manual_seed(number) for _ in arguments.touches],
         ).images

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 import unitouch_gen
 from drawing import GAP, INK, MARGIN, PAPER, to_tile, written
-from unitouch_gen.conditioning import mix_spherical
+from unitouch_gen.conditioning import mix_to_norm
 
 INPUTS = Path(__file__).parent / "inputs"
 
@@ -34,7 +34,7 @@ def main() -> None:
     one, other = pipe.encode_touch(arguments.touches).split(1)
     # Cosine easing: the ends are rests.
     shares = (1 - torch.cos(torch.linspace(0, torch.pi, arguments.frames))) / 2
-    embeds = torch.cat([mix_spherical(torch.stack([one, other]), torch.stack([1 - s, s])) for s in shares])
+    embeds = torch.cat([mix_to_norm(torch.stack([one, other]), torch.stack([1 - s, s])) for s in shares])
     # One noise for all frames, of the embedding as of the latents: what changes is the touch.
     generators = [torch.Generator().manual_seed(arguments.seed) for _ in embeds]
     pictures = pipe(touch_embeds=embeds, generator=generators).images

@@ -97,21 +97,6 @@ def mix_to_norm(embeds: Tensor, weights: Tensor) -> Tensor:
     return match_norm(mix_linear(embeds, weights), 1.0) * embeds.norm(dim=-1).amax(dim=0)[..., None]
 
 
-def mix_spherical(embeds: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1); slerp for two embeddings."""
-    norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
-    unit = match_norm(embeds.double(), 1.0)
-    mean = match_norm(mix_linear(unit, weights), 1.0)
-    for _ in range(30):  # converges linearly; for two embeddings one iteration is exact
-        cosine = (unit * mean).sum(dim=-1, keepdim=True).clamp(-1.0, 1.0)
-        tangent = unit - cosine * mean
-        angle = cosine.arccos()
-        step = mix_linear(tangent * torch.where(angle > 1e-12, angle / angle.sin().clamp_min(1e-12), 1.0), weights)
-        length = step.norm(dim=-1, keepdim=True)
-        mean = length.cos() * mean + torch.where(length > 1e-12, length.sin() / length.clamp_min(1e-12), 1.0) * step
-    return match_norm(mean, 1.0).to(embeds) * norm
-
-
 class StoredCondition(ModelMixin, ConfigMixin):
     """Conditioning stored with a checkpoint, in buffers."""
 

@@ -166,7 +166,7 @@ def x_to_touch_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, e
 
 
 def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, each: int, **options: Any) -> Figures:
-    """Photos restyled by touches of other materials, by default and from noise alone, and as they were.
+    """Photos restyled by touches of other materials, by default and as in the paper, and as they were.
 
     "layout kept" is the correlation of the brightness with the photo's on 8 x 8 fields, "relief of the touch" the mean
     correlation of what is read off the picture with the touch's, and its ceiling that of the touch's own picture.
@@ -184,7 +184,7 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
 
     restyle = partial(generate, pipe, seed, {"image": photos, "touch": touches}, **options)
     shown = {
-        "photo as it was": photos, "restyled photo": restyle(), "restyled from noise": restyle(init_strength=1.0),
+        "photo as it was": photos, "restyled photo": restyle(), "restyled as in the paper": restyle(layout=None),
     }  # fmt: skip
     figures = {}
     for name, images in shown.items():

@@ -31,7 +31,7 @@ BAD = [
     (f"{TO_IMAGE} --solver dimm", "`solver` is 'dimm'", "Did you mean 'ddim'?"),
     (f"{TO_IMAGE} --sensor gelsigt", "Did you mean 'gelsight'?"),
     (f"{TO_IMAGE} --set heigth=8", "`--set` is 'heigth'", "Did you mean 'height'?"),
-    (f"{STYLIZE} --mix slurp", "`mix` is 'slurp'", "Did you mean 'slerp'?"),
+    (f"{STYLIZE} --set mix=papier", "`mix` is 'papier'", "Did you mean 'paper'?"),
     (f"{TO_TOUCH} --text brick --sensor digits", "Did you mean 'digit'?"),
     ("touch-to-image example:brik -o out", "Did you mean 'brick'?"),
     ("batch in -o out --pipeline stylize", "`--pipeline` is 'stylize'", "'stylization'"),

@@ -77,7 +77,7 @@ def test_a_photo_is_restyled_by_each_touch(here, run, pipes):
     rows = run("stylize in/dark.png in/dark.png in/bright.png -o out")["pictures"]
     assert [Path(row["picture"]).name for row in rows] == ["dark-dark.png", "dark-bright.png"]
     alone = pipes["stylize"](
-        "in/dark.png", "in/bright.png", init_strength=0.65, generator=torch.Generator().manual_seed(0)
+        "in/dark.png", "in/bright.png", generator=torch.Generator().manual_seed(0)
     )
     assert abs(np.asarray(alone.images[0], dtype=int) - pixels("out/dark-bright.png")).max() <= 1
 

@@ -71,7 +71,7 @@ def test_the_flow_of_a_pipeline_is_the_one_that_its_call_follows(pipes, name, sc
     # Of few levels: a network of random weights changes with every one of them.
     pipe.scheduler = DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2)
     pipe.set_progress_bar_config(disable=True)
-    options = {"init_strength": 1.0} if name == "stylization" else {}
+    options = {"layout": None} if name == "stylization" else {}
     target = pipeline_target(pipe, inputs, seeds=2, guidance_scale=scale, rtol=0.3, **options)
     generator = torch.Generator().manual_seed(0)
     inputs = {key: value.expand(2, -1, -1, -1) for key, value in inputs.items()}

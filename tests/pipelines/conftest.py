@@ -53,7 +53,7 @@ def x_to_touch(x_components: dict) -> XToTouchPipeline:
 @pytest.fixture(params=["pipe", "stylize", "x_to_touch"])
 def call(request: pytest.FixtureRequest, touch: torch.Tensor, photo: torch.Tensor) -> Call:
     """A call of each pipeline, with two inputs."""
-    inputs = {"pipe": {"touch": touch}, "stylize": {"image": photo, "touch": touch, "init_strength": 1.0}}
+    inputs = {"pipe": {"touch": touch}, "stylize": {"image": photo, "touch": touch, "layout": None}}
     inputs["x_to_touch"] = {"image": photo}
     return Call(request.getfixturevalue(request.param), inputs[request.param])
 

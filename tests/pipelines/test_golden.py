@@ -30,7 +30,7 @@ def stylization() -> torch.Tensor:
     pipe = unitouch_gen.tiny("stylization")
     photo, touch = unitouch_gen.example("wood", "image"), unitouch_gen.example("gravel")
     seeded = torch.Generator().manual_seed(0)
-    return pipe(photo, touch, latents=latents(1), init_strength=1.0, generator=seeded, **CALL).images
+    return pipe(photo, touch, latents=latents(1), layout=None, generator=seeded, **CALL).images
 
 
 def text_to_touch() -> torch.Tensor:

@@ -28,7 +28,7 @@ CALLS: list[tuple[str, dict[str, Any]]] = [
     ("touch-to-image", {**TOUCH, "guidance_scale": 9.0, "callback_on_step_end": halve_guidance}),
     ("touch-to-image", {"touch": example("digit_wood"), "prompt": "a photo of wood", "guidance_scale": 3.0}),
     ("stylization", {**PHOTO, **TOUCH, "touch_weight": 0.2}),
-    ("stylization", {**PHOTO, "touch": example("digit_wood"), "mix": "slerp", "num_inference_steps": 4}),
+    ("stylization", {**PHOTO, "touch": example("digit_wood"), "num_inference_steps": 4}),
     ("x-to-touch", {"text": "rough brick", "solver": "dpm++2m"}),
     ("x-to-touch", {"audio": example("metal", "audio"), "guidance_scale": 7.5}),
     ("x-to-touch", {**PHOTO, "num_candidates": 2}),

@@ -13,7 +13,7 @@ from typer import Argument, Context, Option
 from unitouch_gen.errors import InvalidInputError, check_choice
 
 SETTABLE = (
-    "bridge", "eta", "guidance_scale", "height", "init_strength", "max_evaluations", "mix",
+    "bridge", "eta", "guidance_scale", "height", "init_strength", "keep_colours", "layout", "max_evaluations", "mix",
     "noise_level", "num_candidates", "num_inference_steps", "sigmas", "solver", "strength", "timesteps", "tolerance",
     "touch_weight", "weights", "width",
 )  # fmt: skip

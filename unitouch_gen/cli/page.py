@@ -72,9 +72,9 @@ def style_fields(pipe: Any) -> Fields:
     return {
         "image": upload("image", "Photo"),
         **touch_fields(pipe),
-        "touch_weight": gradio.Slider(0, 1, 0.55, step=0.05, label="Share of the touch in the mix"),
-        "mix": gradio.Radio(["linear", "slerp", "paper"], value="slerp", label="How touch and photo are mixed"),
-        "init_strength": gradio.Slider(0, 1, 0.65, step=0.05, label="How much of the photo's layout goes"),
+        "touch_weight": gradio.Slider(0, 1, 0.7, step=0.05, label="Share of the touch in the mix"),
+        "layout": gradio.Slider(2, 16, 12, step=1, label="How finely the photo's layout is held"),
+        "keep_colours": gradio.Checkbox(False, label="Hold its mean colour, too"),
     }
 
 

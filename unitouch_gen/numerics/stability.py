@@ -230,7 +230,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
     touch, photo = example("brick"), example("wood", "image")
     of_kinds: dict[str, dict[str, Any]] = {
         "touch-to-image": {"touch": touch},
-        "stylization": {"touch": touch, "image": photo, "init_strength": 1.0},
+        "stylization": {"touch": touch, "image": photo},
         "x-to-touch": {"image": photo},
     }
 
