@@ -39,7 +39,7 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, read_json, reading, writing_folder
+from unitouch_gen.files import as_path, local_folder, read_settings, reading, writing_folder
 from unitouch_gen.models.autoencoders import autoencoder_class, decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
@@ -472,7 +472,7 @@ def check_filled(folder: Path, network: Any) -> None:
 
 def autoencoder_in(folder: Path) -> Any:
     """The class of a stored autoencoder."""
-    return autoencoder_class("vae", read_json("vae", folder / "config.json").get("_class_name"))
+    return autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
 
 
 def read_scheduler(folder: Path) -> SchedulerMixin:

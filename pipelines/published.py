@@ -12,7 +12,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from transformers import CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
-from unitouch_gen.files import NEVER_READ, local_folder, read_json, reading
+from unitouch_gen.files import NEVER_READ, local_folder, read_settings, reading
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.base import autoencoder_in, check_filled, read_scheduler
@@ -43,7 +43,7 @@ def read_unclip(
     folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **hub})
     parts = ["image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae"]
     check_holds("unclip", folder, parts, "a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP")
-    width = read_json("unclip", folder / "image_normalizer" / "config.json").get("embedding_dim")
+    width = read_settings("unclip", folder / "image_normalizer" / "config.json").get("embedding_dim")
     if width != model.config.projection_dim:
         raise InvalidInputError(
             f"`unitouch` has embeddings of width {model.config.projection_dim}, `unclip` of width {width}; use models "

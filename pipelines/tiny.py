@@ -11,7 +11,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
-from unitouch_gen.files import as_path, read_json, reading
+from unitouch_gen.files import as_path, read_settings, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.base import UniTouchPipeline, autoencoder_in, check_filled, read_scheduler
 from unitouch_gen.pipelines.hub import Card
@@ -61,7 +61,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             "unet": stored(UNet2DConditionModel, folder / "unet"),
             "scheduler": read_scheduler(folder / "scheduler"),
             "vae": stored(autoencoder_in(vae), vae),
-            **read_json("family", folder / "defaults.json"),
+            **read_settings("family", folder / "defaults.json"),
         }
         if (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
@@ -109,7 +109,8 @@ def _card(family: Path, name: str) -> Card:
     """The model card of a family's pipeline: measured figures and, if built in, its training data."""
     caption, made = SHOWN[name]
     file = family / weights.FIGURES.name
-    rows = (read_json("family", file) if file.is_file() else {}).get("figures", {}).get("quality", {}).get("rows", {})
+    held = read_settings("family", file) if file.is_file() else {}
+    rows = held.get("figures", {}).get("quality", {}).get("rows", {})
     figures = {
         key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
         f"{row['ceiling']:.1%})"

@@ -53,17 +53,16 @@ def test_what_can_be_used_passes(check, value, expected):
 @pytest.mark.parametrize(
     ("check", "value", "error", "words"),
     [
-        (integer, 0, InvalidInputError, "is 0; it has to be an integer from 1 to 5"),
-        (partial(check_integer, "x", low=1), 0, InvalidInputError, "of at least 1"),
+        (integer, 0, InvalidInputError, "is 0; it has to be a number from 1 to 5"),
         *((integer, value, InvalidTypeError, "an integer") for value in (1.0, "1", None, True)),
-        (number, 1.0000001, InvalidInputError, "a finite number from 0 to 1"),
-        *((number, value, InvalidInputError, "a finite number") for value in (math.nan, -math.inf, 10**400)),
-        *((number, value, InvalidTypeError, "finite number") for value in ("0.5", None, False, 1j)),
+        (number, 1.0000001, InvalidInputError, "a number from 0 to 1"),
+        *((number, value, InvalidInputError, "a number") for value in (math.nan, -math.inf, 10**400)),
+        *((number, value, InvalidTypeError, "a number") for value in ("0.5", None, False, 1j)),
         (partial(check_texts, "x"), ["a", 3], InvalidTypeError, "a string or a list of strings"),
-        (partial(check_texts, "x"), [], InvalidInputError, "is empty"),
+        (partial(check_texts, "x"), [], InvalidInputError, "at least one string"),
         (partial(check_texts, "x"), "a\ud800", InvalidInputError, "UTF-8"),
         (partial(check_choice, "x", choices=("heun", "ddim")), "huen", InvalidInputError, "Did you mean 'heun'"),
-        (partial(check_dtype, "x"), torch.int8, InvalidTypeError, "torch.int8"),
+        (partial(check_dtype, "x"), torch.int8, InvalidInputError, "one of 'float32'"),
         (partial(check_dtype, "x"), "float8", InvalidInputError, "one of 'float32'"),
     ],
 )
@@ -77,7 +76,7 @@ def test_what_cannot_be_used_is_refused_by_name(check, value, error, words):
     [
         *((value, ("B", 3), InvalidTypeError) for value in (np.zeros((2, 3)), wide.int(), wide.to_sparse())),
         (wide.to("meta"), ("B", 3), InvalidTypeError),
-        *((wide, shape, InvalidInputError) for shape in (("B", 4), ("S", "S"), ("B",))),
+        *((wide, shape, InvalidInputError) for shape in (("B", 4), ("B", 3, 1), ("B",))),
         *((value, ("B", 3), InvalidInputError) for value in (wide[:0], wide.log(), wide / 0)),
     ],
 )
@@ -86,11 +85,9 @@ def test_tensors_of_other_shapes_kinds_and_values(value, shape, error):
         check_tensor("x", value, *shape)
 
 
-def test_letters_of_a_shape_stand_for_one_size():
-    square = torch.zeros(2, 3, 4, 4)
-    assert check_tensor("x", square, "B", 3, "S", "S") is square
-    assert check_tensor("x", square.log(), "B", 3, "S", "S", finite=False).isinf().all()
-    check_tensor("x", square.int(), "B", 3, "S", "S", integers=True)
+def test_letters_of_a_shape_stand_for_any_size():
+    assert check_tensor("x", wide, "B", 3) is wide
+    assert check_tensor("x", wide.log(), "B", "D", finite=False).isinf().all()
 
 
 @pytest.mark.parametrize("value", ["a" * 500, wide, np.zeros(3), [1, 2], object(), int, None, 10**200])

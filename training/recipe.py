@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from unitouch_gen.errors import InvalidInputError, describe, did_you_mean, first_line
-from unitouch_gen.files import as_path, read_yaml
+from unitouch_gen.files import as_path, read_settings
 
 RECIPES = Path(__file__).parent / "recipes"
 
@@ -43,11 +43,12 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
     `sets` are named, they stand in the place of the contacts and grasps that the base draws.
     """
-    recipe = read_yaml("recipe", _file_of("recipe", path))
+    recipe = read_settings("recipe", _file_of("recipe", path), yaml.safe_load)
     data, drawn_by_base = recipe.get("data"), False
     if isinstance(data, dict) and "base" in data:
         drawn_by_base = "drawn" not in data and not any(one.startswith("data.drawn") for one in overrides)
-        recipe["data"] = read_yaml("data.base", _file_of("data.base", data.pop("base"))) | data
+        base = read_settings("data.base", _file_of("data.base", data.pop("base")), yaml.safe_load)
+        recipe["data"] = base | data
     recipe = overridden(recipe, overrides)
     if drawn_by_base and recipe["data"].get("sets"):
         recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}

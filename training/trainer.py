@@ -30,7 +30,7 @@ from torch.optim.swa_utils import update_bn
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
-from unitouch_gen.files import read_json, write_file
+from unitouch_gen.files import read_settings, write_file
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.recipe import Seed, Settings, Share
@@ -235,7 +235,7 @@ def checkpoints_in(output: Path) -> list[Path]:
 def read_progress(output: Path) -> dict[str, Any]:
     """What a run's last checkpoint holds beside its state: `step`, `seconds`, and what the trainer was given."""
     if found := checkpoints_in(output):
-        return read_json("resume", found[-1] / "progress.json")
+        return read_settings("resume", found[-1] / "progress.json")
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
 
 

@@ -1,7 +1,7 @@
-"""Error types, and the checks of arguments.
+"""Error types, and the checks of arguments, each of which returns what came.
 
-Each check returns what came. A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used an
-`InvalidInputError`; the message names the argument, what came, and what to do.
+A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used an `InvalidInputError`; the message
+names the argument, what came, and what to do.
 """
 
 import io
@@ -69,11 +69,9 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
 
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
-    if isinstance(value, Real | str) or value is None:
+    if value is None or isinstance(value, Real | str | type):
         text = str(value) if isinstance(value, Real) else repr(value)
         return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = "a tensor" if hasattr(value, "layout") else "an array"
         return f"{kind} of shape {tuple(value.shape)} and dtype {str(value.dtype).removeprefix('torch.')}"
@@ -86,13 +84,11 @@ def first_line(error: BaseException) -> str:
 
 
 def needed(module: str, extra: str = "train") -> Any:
-    """Imports a module of an extra; raises `InvalidInputError` if it is not installed."""
+    """Imports a module of an extra."""
     try:
         return import_module(module)
     except ImportError as error:
-        raise InvalidInputError(
-            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[{extra}]'"
-        ) from error
+        raise InvalidInputError(f"`{module}` is not installed; run: pip install 'unitouch_gen[{extra}]'") from error
 
 
 def did_you_mean(value: Any, choices: Iterable[str]) -> str:
@@ -103,37 +99,33 @@ def did_you_mean(value: Any, choices: Iterable[str]) -> str:
     return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
 
 
-def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:
+def check_kind(name: str, value: Any, *kinds: type) -> Any:
+    """An instance of one of some classes."""
+    if not isinstance(value, kinds):
+        known = " or ".join(kind.__name__ for kind in kinds)
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a {known}.")
+    return value
+
+
+def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     """An integer from `low` to `high`, as an int; booleans are none."""
-    return int(_check_range(name, value, Integral, "an integer", low, math.inf if high is None else high, hint))
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be an integer.")
+    check_number(name, value, low, high)
+    return int(value)
 
 
-def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
+def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number from `low` to `high`, as a float; booleans are none."""
-    return float(_check_range(name, value, Real, "a finite number", low, high, hint))
-
-
-def _check_range(name: str, value: Any, kind: Any, noun: str, low: float, high: float, hint: str) -> Any:
-    ends = [str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high)]
-    span = "" if low == -math.inf else f" of at least {ends[0]}" if high == math.inf else f" from {' to '.join(ends)}"
-    message = f"`{name}` is {describe(value)}; it has to be {noun}{span}. {hint}".strip()
-    if isinstance(value, bool) or not isinstance(value, kind):
-        raise InvalidTypeError(message)
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number.")
     try:
         fits = math.isfinite(value) and low <= value <= high
     except OverflowError:  # of integers beyond the range of floats
         fits = False
     if not fits:
-        raise InvalidInputError(message)
-    return value
-
-
-def check_kind(name: str, value: Any, *kinds: type, hint: str = "") -> Any:
-    """An instance of one of some classes."""
-    if not isinstance(value, kinds):
-        known = " or ".join(kind.__name__ for kind in kinds)
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a {known}. {hint}".strip())
-    return value
+        raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be a number from {low:g} to {high:g}.")
+    return float(value)
 
 
 def check_texts(name: str, value: Any) -> list[str]:
@@ -141,10 +133,8 @@ def check_texts(name: str, value: Any) -> list[str]:
     texts = [value] if isinstance(value, str) else value
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
-    if not texts:
-        raise InvalidInputError(f"`{name}` is empty; pass at least one string.")
-    if any("\ud800" <= letter <= "\udfff" for letter in "".join(texts)):  # surrogates, of bytes in another encoding
-        raise InvalidInputError(f"`{name}` is {describe(value)}, which is no Unicode; use UTF-8.")
+    if not texts or any("\ud800" <= letter <= "\udfff" for letter in "".join(texts)):  # bytes in another encoding
+        raise InvalidInputError(f"`{name}` is {describe(value)}; pass at least one string, in UTF-8.")
     return list(texts)
 
 
@@ -160,30 +150,21 @@ def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "
 def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     """A tensor of finite values; the message counts the others."""
     if bad := int((~tensor.isfinite()).sum()):
-        values = f"{bad} of {tensor.numel()} values that are NaN or infinite"
-        raise InvalidInputError(f"`{name}` holds {values}; pass finite values only.")
+        raise InvalidInputError(f"`{name}` holds {bad} of {tensor.numel()} values that are NaN or infinite.")
     return tensor
 
 
-def check_tensor(
-    name: str, value: Any, *shape: int | str, integers: bool = False, finite: bool = True, hint: str = ""
-) -> "torch.Tensor":
-    """A dense tensor of some shape, of finite floating-point numbers or of integers.
-
-    A letter in the shape stands for any size of at least 1, everywhere the same one: "B", 3, "S", "S".
-    """
+def check_tensor(name: str, value: Any, *shape: int | str, finite: bool = True) -> "torch.Tensor":
+    """A dense tensor of floating-point numbers of some shape; a letter in it stands for any size of at least 1."""
     import torch
 
-    form = f"a tensor ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
-    message = f"`{name}` is {describe(value)}; it has to be {form}. {hint}".strip()
-    if not isinstance(value, torch.Tensor):
+    form = ", ".join(map(str, shape))
+    message = f"`{name}` is {describe(value)}; it has to be a dense floating-point tensor ({form})."
+    dense = isinstance(value, torch.Tensor) and value.layout == torch.strided and not value.is_meta
+    if not dense or not value.is_floating_point():
         raise InvalidTypeError(message)
-    known = not (value.is_complex() or value.dtype == torch.bool or value.is_quantized)
-    if value.layout != torch.strided or value.is_meta or value.is_floating_point() == integers or not known:
-        kind = "integers" if integers else "floating-point numbers"
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a dense tensor of {kind}.")
-    sizes: dict[Any, Any] = {letter: max(size, 1) for letter, size in zip(shape, value.shape, strict=False)}
-    if tuple(value.shape) != tuple(sizes.get(one) if isinstance(one, str) else one for one in shape):
+    sizes = [max(size, 1) if isinstance(one, str) else one for one, size in zip(shape, value.shape, strict=False)]
+    if len(shape) != value.ndim or sizes != list(value.shape):
         raise InvalidInputError(message)
     return check_finite(name, value) if finite else value
 
@@ -193,9 +174,4 @@ def check_dtype(name: str, value: Any) -> "torch.dtype":
     import torch
 
     names = ("float32", "float16", "bfloat16", "float64")
-    if isinstance(value, str):
-        return getattr(torch, check_choice(name, value.removeprefix("torch."), names))
-    if not isinstance(value, torch.dtype) or str(value).removeprefix("torch.") not in names:
-        what = value if isinstance(value, torch.dtype) else describe(value)
-        raise InvalidTypeError(f"`{name}` is {what}; pass torch.float32 or torch.bfloat16, for example.")
-    return value
+    return getattr(torch, check_choice(name, str(value).removeprefix("torch."), names))

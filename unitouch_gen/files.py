@@ -2,9 +2,7 @@
 
 import ctypes
 import functools
-import inspect
 import json
-import logging
 import os
 import re
 import shutil
@@ -15,52 +13,43 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, first_line
+from unitouch_gen.errors import InvalidInputError, check_kind, describe, first_line
 
-FETCH_OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
 
-LOADING = threading.RLock()
-"""Held while libraries read networks, for which they patch torch in all threads."""
+_LOADING = threading.RLock()  # libraries patch torch in all threads while they read networks
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def _hidden_beside(name: str, target: Path, folder: Path | None = None) -> Iterator[Path]:
+def _hidden_beside(
+    name: str, target: Path, kind: Callable[[Path], bool] = os.path.isfile, folder: Path | None = None
+) -> Iterator[Path]:
     """A hidden folder beside a target, or in `folder`; errors of writing name the argument that the target came in."""
     folder = folder or target.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if os.path.exists(target) and not kind(target):
+            raise FileExistsError(17, "something of another kind is there")
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=folder) as hidden:
             yield Path(hidden)
-    except InvalidInputError:
-        raise
-    except Exception as error:  # torch's writer and libraries in Rust have no class of their own
-        if not isinstance(error, OSError) and not re.search(r"inline_container|\(os error \d+\)", str(error)):
+    except Exception as error:  # libraries in Rust have no class of their own
+        if isinstance(error, InvalidInputError) or not (isinstance(error, OSError) or "(os error" in str(error)):
             raise
-        why = getattr(error, "strerror", None) or first_line(error)
-        raise InvalidInputError(
-            f"`{name}` cannot be written to {str(target)!r}: {why}. Nothing was changed."
-        ) from error
-
-
-def _is_device(file: Path) -> bool:
-    return os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file)
+        why = f"{getattr(error, 'strerror', None) or first_line(error)}. Nothing was changed."
+        raise InvalidInputError(f"`{name}` cannot be written to {str(target)!r}: {why}") from error
 
 
 @contextmanager
 def replacing(name: str, file: Path) -> Iterator[Path]:
     """A path of the same name to write to, which takes the place of a file when the block ends without an error.
 
-    A device is written to directly. Raises `InvalidInputError` if it cannot be written; what was there stays.
+    Raises `InvalidInputError` if it cannot be written, or is a folder or a device; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    if _is_device(target):
-        yield target
-        return
     with _hidden_beside(name, target) as hidden:
         yield hidden / file.name
         os.replace(hidden / file.name, target)
@@ -77,13 +66,8 @@ def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
     above = next(parent for parent in target.parents if os.path.exists(parent))  # unlike Path.exists, of any length
-    if not _is_device(target):
-        with _hidden_beside(name, target, above) as hidden:
-            if os.path.isdir(target):
-                raise IsADirectoryError(21, "it is a folder")
-            place = hidden / target.relative_to(above)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.touch()
+    with _hidden_beside(name, target, folder=above):
+        pass
 
 
 @contextmanager
@@ -95,9 +79,7 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
     one. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(folder))
-    with _hidden_beside(name, target) as hidden:
-        if target.exists() and not target.is_dir():
-            raise NotADirectoryError(20, "it is a file")
+    with _hidden_beside(name, target, os.path.isdir) as hidden:
         new = hidden / target.name
         new.mkdir()
         yield new
@@ -105,10 +87,10 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
             os.rename(new, target)
             return
         written = {entry.name for entry in new.iterdir()} if replace else set()
-        for file in sorted(target.rglob("*")):
-            place = new / file.relative_to(target)
-            replaced = place.exists() or file.relative_to(target).parts[0] in written or _superseded(place)
-            if file.is_file() and not replaced:
+        for file in filter(os.path.isfile, sorted(target.rglob("*"))):
+            part = file.relative_to(target)
+            place = new / part
+            if not (place.exists() or part.parts[0] in written or _superseded(place)):
                 place.parent.mkdir(parents=True, exist_ok=True)
                 try:
                     os.link(file, place)
@@ -119,12 +101,9 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
 
 def _superseded(file: Path) -> bool:
     """Whether it names weights of which its folder holds others: shards and a single file, of the same variant."""
-
-    def kind(name: str) -> str:
-        return re.sub(r"-\d+-of-\d+|\.index|\.json|\.safetensors", "", name)
-
+    variant = functools.partial(re.sub, r"-\d+-of-\d+|\.index|\.json", "")
     others = file.parent.glob("*.safetensors*")
-    return ".safetensors" in file.name and any(kind(other.name) == kind(file.name) for other in others)
+    return ".safetensors" in file.name and variant(file.name) in [variant(other.name) for other in others]
 
 
 def _exchange(one: Path, other: Path) -> None:
@@ -141,13 +120,11 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
 
     @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
     def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
-        folder = as_path("save_directory", save_directory)
+        folder, repo_id = as_path("save_directory", save_directory), kwargs.pop("repo_id", None)
         with writing_folder("save_directory", folder) as place:
             save(self, place, *args, **kwargs)
         if push_to_hub:
-            known = inspect.signature(self.push_to_hub).parameters
-            options = {"repo_id": folder.resolve().name, **kwargs}
-            self.push_to_hub(**{key: value for key, value in options.items() if key in known})
+            self.push_to_hub(repo_id or folder.resolve().name, token=kwargs.get("token"))
 
     return save_pretrained
 
@@ -157,46 +134,35 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
 
 def as_path(name: str, place: Any) -> Path:
     """A path that came in the argument `name`, with `~` as the home folder."""
-    if not isinstance(place, str | os.PathLike):
-        raise InvalidTypeError(f"`{name}` is {describe(place)}; it has to be a path.")
-    if not str(place) or "\0" in str(place):
+    if not str(check_kind(name, place, str, os.PathLike)) or "\0" in str(place):
         raise InvalidInputError(f"`{name}` is {describe(str(place))}; it has to be the path of a file or folder.")
     return Path(place).expanduser()
 
 
 def check_file(name: str, path: str | os.PathLike, what: str) -> None:
     """Raises `InvalidInputError` if there is no file of that path; `what` should be there, such as "an image file"."""
-    if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
-        return
-    if re.match(r"\w+://", str(path)):
-        raise InvalidInputError(
-            f"`{name}` is {describe(str(path))}, an address; download it, and pass the file's path."
-        )
-    why = "is a folder" if os.path.isdir(path) else "is no regular file" if os.path.exists(path) else "does not exist"
-    raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
+    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        why = "is a folder" if os.path.isdir(path) else "is no file" if os.path.exists(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
 
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
-    """A folder as it is, or the local copy of a repository.
+    """A folder as it is, or the local copy of a repository, without files that are `NEVER_READ`.
 
-    Of the options those of a fetch are used, `FETCH_OPTIONS`; files that are `NEVER_READ` are not fetched. Raises
-    `InvalidInputError` if it is neither a folder nor a repository that can be fetched.
+    Of the options, which are those of `from_pretrained`, the ones of a fetch are used.
     """
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         return folder
-    if str(place).startswith((".", "/", "~")) or os.path.isfile(folder):
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; pass one, or a repository id.")
     from huggingface_hub import snapshot_download
 
-    known = {key: value for key, value in options.items() if key in FETCH_OPTIONS and value is not None}
+    known = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
+    given = {key: options[key] for key in known if options.get(key) is not None}
     try:
-        return Path(snapshot_download(str(place), **{"ignore_patterns": NEVER_READ, **known}))
+        return Path(snapshot_download(str(place), **{"ignore_patterns": NEVER_READ, **given}))
     except (OSError, ValueError) as error:  # the second of what is no id
-        raise InvalidInputError(
-            f"`{name}` is {str(place)!r}, which is no folder here, and no repository of that id could be fetched: "
-            f"{first_line(error)}"
-        ) from error
+        why = f"no folder here, and no repository that can be fetched: {first_line(error)}"
+        raise InvalidInputError(f"`{name}` is {str(place)!r}, {why}") from error
 
 
 def natural(path: str | Path) -> list[Any]:
@@ -204,60 +170,31 @@ def natural(path: str | Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
-def read_text(name: str, file: Path, what: str) -> str:
-    """The text, in UTF-8, of a regular file of at most 1 GiB; `what` names the format in messages."""
-    check_file(name, file, f"a {what} file")
+def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.loads) -> dict[str, Any]:
+    """The settings in a file in UTF-8: JSON, or what another parser reads."""
+    check_file(name, file, "a settings file")
     try:
-        if file.stat().st_size > 2**30:
-            raise ValueError("it has more than 1 GiB")
-        return file.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read as {what}: {error}.") from error
-
-
-def read_json(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a JSON file."""
-    return _read_settings(name, file, "JSON", json.loads)
-
-
-def read_yaml(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a YAML file."""
-    import yaml
-
-    return _read_settings(name, file, "YAML", yaml.safe_load)
-
-
-def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any]) -> dict[str, Any]:
-    try:
-        found = load(read_text(name, file, what))
+        found = parse(file.read_text(encoding="utf-8"))
         if not isinstance(found, dict):
             raise ValueError(f"it holds {describe(found)} and no settings")
-    except InvalidInputError:
-        raise
     except Exception as error:  # of the format, of dates, of integers of thousands of digits
         why = first_line(error)
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read as {what}: {why}.") from error
+        raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read: {why}.") from error
     return found
 
 
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
-    folder, libraries = as_path(name, place), logging.getLogger("diffusers")
-    with LOADING:
-        level = libraries.level
-        libraries.setLevel(logging.CRITICAL)  # what diffusers logs as an error it raises as well
+    folder = as_path(name, place)
+    with _LOADING:
         try:
             for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
-                read_json(name, file)  # libraries name no file
+                read_settings(name, file)  # libraries name no file, and would wait for a pipe
             yield
-        except MemoryError:
-            raise
         except Exception as error:  # of as many kinds as there are readers
             if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
                 raise
-            reason = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
+            why = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
             hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
-            raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {reason}{hint}") from error
-        finally:
-            libraries.setLevel(level)
+            raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}{hint}") from error

@@ -48,30 +48,11 @@ class ReturnCode(StrEnum):
         return code
 
     SUCCESS = "success", "The sample is finite."
-    NON_FINITE = (
-        "non_finite",
-        "The latents are not finite. Lower `guidance_scale` or `strength`, raise `num_inference_steps`, or run the "
-        "network in float32.",
-    )
-    MAX_EVALUATIONS = (
-        "max_evaluations",
-        "The tolerance was not reached within `max_evaluations`, and the sample is unfinished. Allow more evaluations, "
-        "or a larger `tolerance`.",
-    )
-    STEP_TOO_SMALL = (
-        "step_too_small",
-        "No step was small enough for the tolerance, and the sample is unfinished. Allow a larger `tolerance`, lower "
-        "`guidance_scale`, or run the network in float32.",
-    )
-    DIVERGED = (
-        "diverged",
-        "The latents grew far beyond those of any picture, and are not to be trusted. Lower `guidance_scale`, or take "
-        "more steps.",
-    )
-    INTERRUPTED = (
-        "interrupted",
-        "The call was interrupted, and noise is left in the sample. Call again to finish it.",
-    )
+    NON_FINITE = "non_finite", "Not finite. Lower `guidance_scale` or `strength`, take more steps, or run in float32."
+    DIVERGED = "diverged", "Far larger than the latents of pictures. Lower `guidance_scale`, or take more steps."
+    MAX_EVALUATIONS = "max_evaluations", "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`."
+    STEP_TOO_SMALL = "step_too_small", "Unfinished. Allow a larger `tolerance`, lower `guidance_scale`, or use float32."
+    INTERRUPTED = "interrupted", "Interrupted, with noise left in the sample. Call again to finish it."
 
     @property
     def finite(self) -> bool:
@@ -85,10 +66,8 @@ class RunReport:
 
     solver: str = ""  #: a name in `SOLVERS`, "adaptive", or the class of the pipeline's own scheduler
     steps: int = 0  #: requested, or accepted with a tolerance
-    rejected: int = 0  #: steps rejected with a tolerance
     evaluations: int = 0  #: calls of the denoising network; with guidance one call holds both branches
     guided: int = 0  #: calls that held both branches
-    guidance_scale: float = 1.0  #: at the start; a callback may change it
     seconds: dict[str, float] = field(default_factory=dict)  #: wall-clock time of each stage
     codes: list[ReturnCode] = field(default_factory=list)  #: one for each sample
     #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
@@ -101,7 +80,6 @@ class RunReport:
     chosen: list[int] = field(default_factory=list)  #: indices of the samples chosen among candidates
     scores: list[float] = field(default_factory=list)  #: cosine of each chosen sample's embedding to the condition
     left_out: list[str] = field(default_factory=list)  #: parts that were not needed and did not run
-    tolerance: float | None = None  #: requested relative RMS error of the latents
 
     @property
     def success(self) -> bool:
@@ -116,25 +94,6 @@ class RunReport:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
-
-    @classmethod
-    def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
-        """One report of several calls with equal arguments: samples concatenated, evaluations and seconds summed."""
-        first = reports[0]
-        whole = cls(first.solver, guidance_scale=first.guidance_scale, tolerance=first.tolerance)
-        for report in reports:
-            before = len(whole.codes)
-            whole.steps = max(whole.steps, report.steps)
-            whole.failed_at |= {before + sample: step for sample, step in report.failed_at.items()}
-            whole.chosen += [before + sample for sample in report.chosen]
-            whole.left_out += [part for part in report.left_out if part not in whole.left_out]
-            for name in ("rejected", "evaluations", "guided", "codes", "scores", "sensors", "sensor_distances"):
-                setattr(whole, name, getattr(whole, name) + getattr(report, name))
-            for stage, seconds in report.seconds.items():
-                whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
-            for modality, reasons in report.unknown.items():
-                whole.unknown[modality] = whole.unknown.get(modality, []) + reasons
-        return whole
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -226,7 +185,7 @@ def prepare_steps(
     schedule, prediction_type = NoiseSchedule.of(scheduler), config.get("prediction_type")
     check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
     if tolerance is not None:
-        check_number("tolerance", tolerance, 1e-5, 1.0, hint="It is a relative error of float32 latents.")
+        check_number("tolerance", tolerance, 1e-5, 1.0)
         limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
         start = schedule.karras_level(1.0 - init_strength)
         return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
@@ -268,10 +227,10 @@ def check_falling(name: str, values: Any, high: float) -> list[float]:
     numbers = values.tolist() if hasattr(values, "tolist") else list(check_kind(name, values, list, tuple))
     for place, number in enumerate(numbers):
         check_number(f"{name}[{place}]", number, 0.0, high)
-    if not numbers or any(after >= before for before, after in pairwise(numbers)):
-        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to be numbers, each below the one before.")
-    if name == "sigmas" and (numbers[-1] != 0.0 or len(numbers) < 2):
-        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to end in 0, where the picture is.")
+    wrong_end = name == "sigmas" and (numbers[-1:] != [0.0] or len(numbers) < 2)
+    if not numbers or wrong_end or any(after >= before for before, after in pairwise(numbers)):
+        wanted = "numbers, each below the one before" + (", that end in 0" if name == "sigmas" else "")
+        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to be {wanted}.")
     return numbers
 
 
@@ -300,6 +259,8 @@ class Guidance:
 Network = Callable[[Tensor, Tensor], Tensor]
 """(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
+OnStep = Callable[[int, Tensor, Tensor, "Run"], Tensor | None]
+
 DIVERGED_RMS = 10.0
 """RMS of z above which a sample counts as diverged. Networks are trained at RMS 1. The built-in family in 20 steps
 reaches 1.3 at guidance 7.5, 7.4 at 100, and 10 to 24 at 1000."""
@@ -320,7 +281,7 @@ def sample(
     init: Tensor | None = None,
     generator: Any = None,
     throw: bool = True,
-    on_step: "OnStep | None" = None,
+    on_step: OnStep | None = None,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Tensor:
     """From noise to latents, float32 (B, C, h, w). Non-finite samples are returned as zeros.
@@ -344,8 +305,7 @@ def sample(
         NotConvergedError: If a tolerance is not reached and `throw` is set.
     """
     noise, init = noise.float(), None if init is None else init.float()
-    report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
-    report.codes = [ReturnCode.SUCCESS] * len(noise)
+    report.solver, report.codes = steps.solver, [ReturnCode.SUCCESS] * len(noise)
     run = Run(network, steps, report, guidance, throw, on_step, progress, noise)
     try:
         latents = (run_solver if steps.scheduler is None else run_scheduler)(run, noise, init, generator)
@@ -403,7 +363,7 @@ class Run:
     report: RunReport
     guidance: Guidance
     throw: bool
-    on_step: "OnStep | None"
+    on_step: OnStep | None
     progress: Callable[[float], object]
     latents: Tensor  # after the last step, (B, C, h, w)
     sigma: float = 0.0  # after the last step; unused by `run_scheduler`
@@ -423,14 +383,14 @@ class Run:
         return self.guidance.combine(prediction) if guided else prediction
 
     def end_step(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
-        """Zeros newly non-finite samples, then calls `on_step` with latents = `scale` * `state`."""
-        state = self.zero_nonfinite(step, state)
-        self.latents, self.report.steps = state * scale, step + 1
-        changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
-        if changed is not None and changed is not self.latents:
+        """Calls `on_step` with latents = `scale` * `state`, then zeros samples that are not finite."""
+        latents, self.report.steps = state * scale, step + 1
+        changed = None if self.on_step is None else self.on_step(step, timestep, latents, self)
+        if changed is not None and changed is not latents:
             check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
-            state = self.zero_nonfinite(step, changed.to(state) / scale)
-            self.latents = state * scale
+            state = changed.to(state) / scale
+        state = self.zero_nonfinite(step, state)
+        self.latents = state * scale
         return state
 
     def zero_nonfinite(self, step: int, latents: Tensor) -> Tensor:
@@ -474,9 +434,5 @@ class Run:
 
     def after_rejection(self, step: float) -> None:
         """Called after each rejected adaptive step with its size in log sigma."""
-        self.report.rejected += 1
         if step <= 1e-4:  # below it float32 cannot tell states apart
             raise _EndedError(ReturnCode.STEP_TOO_SMALL)
-
-
-OnStep = Callable[[int, Tensor, Tensor, Run], Tensor | None]

@@ -53,7 +53,7 @@ BAD = [
     ("doctor --device meta", "`--device` is 'meta'"),
     # Files
     ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
-    ("touch-to-image https://example.org/touch.png -o out", "an address"),
+    ("touch-to-image https://example.org/touch.png -o out", "touch.png', which does not exist"),
     ("touch-to-image empty -o out", "'empty', where there are no images"),
     ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
     ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cannot be read as an image"),

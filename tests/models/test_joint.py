@@ -180,7 +180,7 @@ def test_encoders_read_later_follow_casts_and_moves(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "words"),
     [("{folder}/nothing/here", "no folder"), ("{folder}/..", r"no config\.json"), ("x" * 5000, "is"), (3, "3"),
-     ("user/no-such-model", "no repository of that id could be fetched")],
+     ("user/no-such-model", "no repository that can be fetched")],
 )  # fmt: skip
 def test_what_is_no_folder_of_a_model_is_refused(folder: Path, place, words) -> None:
     place = place.format(folder=folder) if isinstance(place, str) else place

@@ -2,21 +2,15 @@
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import pairwise
 
 import pytest
 import torch
-from torch import Tensor
 
 from unitouch_gen.numerics.problems import PROBLEMS
 from unitouch_gen.numerics.stability import Case, a_priori, carried, cases, error, solve
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.sampling import SOLVERS, ReturnCode
-from unitouch_gen.schedule import NoiseSchedule
-from unitouch_gen.solvers import AfterStep, Denoise, Levels, Solver, denoised_at_zero, unchanged
+from unitouch_gen.sampling import ReturnCode
 
 KINDS = ("touch-to-image", "stylization", "x-to-touch")
 TABLE = cases(tiny, KINDS)
@@ -65,30 +59,3 @@ def test_a_priori_errors_are_above_those_of_solvers_and_near_them(solver: str, l
     problem = PROBLEMS["conditioning-1e2"]
     bound = a_priori(problem, solver, steps)
     assert least * bound < solve(problem, solver=solver, num_inference_steps=steps) < bound
-
-
-def adams_bashforth(
-    denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged, share: float = 1.0
-) -> Tensor:
-    """Two steps of Adams and Bashforth in sigma: a line through the slope, of which a share is taken."""
-    levels: Levels = []
-    earlier = torch.zeros_like(x)
-    for step, (sigma, target) in enumerate(pairwise(sigmas)):
-        levels.append((sigma, denoise(x, sigma)))
-        if target == 0.0:
-            return after_step(step, denoised_at_zero(levels), target)
-        change = slope = (x - levels[-1][1]) / sigma
-        if step > 0:
-            change = slope + share * (target - sigma) / (2 * (sigma - levels[-2][0])) * (slope - earlier)
-        earlier, x = slope, after_step(step, x + (target - sigma) * change, target)
-    return x
-
-
-@pytest.mark.parametrize(("share", "kept"), [(1.0, True), (0.0, False), (-1.0, False)])
-@pytest.mark.parametrize("name", ["conditioning-1e2", "conditioning-1e6", "conditioning-1e12", "gaussian-guided-30"])
-def test_bounds_admit_a_solver_of_second_order_in_sigma_and_none_of_first(
-    name: str, share: float, kept: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    solver = Solver(partial(adams_bashforth, share=share), 2, NoiseSchedule.karras)
-    monkeypatch.setitem(SOLVERS, "ab2", solver)
-    assert (solve(PROBLEMS[name], solver="ab2") <= a_priori(PROBLEMS[name], "ab2")) is kept

@@ -12,7 +12,7 @@ from unitouch_gen.sampling import ReturnCode, RunReport
 @pytest.fixture
 def report() -> RunReport:
     return RunReport(
-        solver="unipc", steps=10, evaluations=10, guidance_scale=7.5, seconds={"touch": 0.25, "denoising": 1.5},
+        solver="unipc", steps=10, evaluations=10, seconds={"touch": 0.25, "denoising": 1.5},
         codes=[ReturnCode.SUCCESS, ReturnCode.NON_FINITE], failed_at={1: 3}, sensors=["digit", None],
         sensor_distances=[0.1, None], left_out=["VAE"],
     )  # fmt: skip
@@ -30,25 +30,6 @@ def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
             time.sleep(0.01)
             raise KeyError
     assert 0.02 <= report.seconds["touch"] <= time.perf_counter() - started
-
-
-def test_reports_are_joined_in_the_order_of_their_samples(report):
-    other = RunReport(
-        solver="unipc", steps=10, evaluations=4, guidance_scale=7.5, seconds={"denoising": 0.5, "decoding": 0.25},
-        codes=[ReturnCode.NON_FINITE], failed_at={0: 2}, sensors=["taxim"], sensor_distances=[0.2], left_out=["VAE"],
-        chosen=[0], unknown={"touch": ["unlike anything known"]},
-    )  # fmt: skip
-    whole = RunReport.joined([report, other])
-    assert (whole.solver, whole.steps, whole.evaluations, whole.guidance_scale) == ("unipc", 10, 14, 7.5)
-    assert whole.seconds == {"touch": 0.25, "denoising": 2.0, "decoding": 0.25}
-    assert whole.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.NON_FINITE]
-    assert (whole.failed_at, whole.chosen) == ({1: 3, 2: 2}, [2])
-    assert (whole.sensors, whole.sensor_distances) == (["digit", None, "taxim"], [0.1, None, 0.2])
-    assert whole.left_out == ["VAE"] and whole.unknown == other.unknown
-    alone = RunReport.joined([report])
-    assert alone == report
-    alone.codes.clear()
-    assert report.codes
 
 
 def test_the_report_goes_through_json_as_a_copy(report):

@@ -100,17 +100,18 @@ def in_folder(folder: Path, pipeline: str) -> list[dict[str, str]]:
 
 def in_list(file: Path) -> list[dict[str, Any]]:
     """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
-    from unitouch_gen.files import read_text
+    from unitouch_gen.files import check_file
 
-    lines = read_text("source", file, ".csv or .jsonl").removeprefix("\ufeff").splitlines(keepends=True)
+    check_file("source", file, "a .csv or .jsonl file")
     try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines(keepends=True)
         if file.suffix == ".csv":
             rows: list[Any] = list(csv.DictReader(lines, restkey="a cell without a column", strict=True))
         else:
             rows = [dict(json.loads(line)) for line in lines if line.strip()]
-    except (csv.Error, ValueError, TypeError, RecursionError) as error:
-        why = f"which is no .csv or .jsonl: {first_line(error)}."
-        raise InvalidInputError(f"`source` is {str(file)!r}, {why}") from error
+    except (csv.Error, OSError, ValueError, TypeError, RecursionError) as error:
+        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
+        raise InvalidInputError(message) from error
     return [{column: value for column, value in row.items() if value not in (None, "")} for row in rows]
 
 

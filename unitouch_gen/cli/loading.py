@@ -1,6 +1,7 @@
 """Files and models that commands run on."""
 
 import glob
+import logging
 import os
 import re
 from collections.abc import Sequence
@@ -80,6 +81,7 @@ def load_pipeline(
     from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
+    diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # what diffusers logs as an error it raises as well
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
@@ -127,9 +129,9 @@ def folder_of(model: str) -> Path:
 
 def kind_of(model: str) -> str:
     """The name among `CLASSES` of a saved pipeline."""
-    from unitouch_gen.files import read_json
+    from unitouch_gen.files import read_settings
 
-    name = read_json("--model", folder_of(model) / "model_index.json").get("_class_name")
+    name = read_settings("--model", folder_of(model) / "model_index.json").get("_class_name")
     name = name[-1] if isinstance(name, list) and name else name  # [module, class] on the Hub
     if name not in CLASSES.values():
         known = ", ".join(CLASSES.values())

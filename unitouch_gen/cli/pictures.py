@@ -201,9 +201,7 @@ def described(picture: Picture, report: "RunReport", place: int) -> dict[str, An
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by the options of a command, saves each when its call has ended, and prints what came of them."""
-    from unitouch_gen.sampling import RunReport
-
-    given, reports, rows = context.params, list[RunReport](), list[dict[str, Any]]()
+    given, reports, rows = context.params, list["RunReport"](), list[dict[str, Any]]()
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
     processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
@@ -219,15 +217,15 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
             save(image, picture.file)
             rows.append(described(picture, output.report, place))
         reports.append(output.report)
-    report = RunReport.joined(reports)
-    codes = [code for code in dict.fromkeys(report.codes) if code != "success"]
+    codes = dict.fromkeys(code for report in reports for code in report.codes if code != "success")
     options.note(*(f"a picture is {code.value}: {code.message}" for code in codes))
     if given["as_json"]:
-        echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
+        echo(json.dumps({"pictures": rows, "reports": [report.to_dict() for report in reports]}))
         return
     noun, first = "touch image" if context.info_name == "x-to-touch" else "picture", pictures[0].file.resolve()
     columns = list(dict.fromkeys(name for row in rows for name in row if name != "sensor_distance"))
     cells = [[Path(row.get(name) or "-").name for name in columns] for row in rows]
     options.print_table([noun, *columns[1:]], cells)
     echo(f"{noun.capitalize()}s are in {first.parent}" if len(rows) > 1 else f"The {noun} is {first}")
-    echo(f"Run report: {report}")
+    for report in reports:
+        echo(f"Run report: {report}")

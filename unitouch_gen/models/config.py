@@ -166,7 +166,7 @@ class UniTouchConfig(PreTrainedConfig):
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
         for name in ("temperature", "embedding_norm"):
-            check_number(name, getattr(self, name), 1e-30, hint="It has to be above 0.")
+            check_number(name, getattr(self, name), 1e-30)
         for name in ("vision", "text", "touch", "audio"):
             width = getattr(self, f"{name}_config").projection_dim
             check_integer(f"{name}_config.projection_dim", width, self.projection_dim, self.projection_dim)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
-from unitouch_gen.files import as_path, check_file, local_folder, read_json, reading, saved_whole
+from unitouch_gen.files import as_path, check_file, local_folder, read_settings, reading, saved_whole
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
@@ -326,7 +326,7 @@ def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor
     part, found = f".{variant}" if variant else "", dict[str, Tensor]()
     index, files = folder / f"model.safetensors.index{part}.json", {f"model{part}.safetensors"}
     if index.is_file():
-        files = {Path(file).name for file in read_json("source", index)["weight_map"].values()}  # never outside
+        files = {Path(file).name for file in read_settings("source", index)["weight_map"].values()}  # never outside
     for file in sorted(folder / name for name in files):
         try:
             check_file("source", file, "weights")  # a pipe would never be opened

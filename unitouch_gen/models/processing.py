@@ -26,7 +26,7 @@ _TOKENIZING = threading.Lock()  # tokenizers keep how to cut and pad on themselv
 
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
     """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut."""
-    check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint="Set it in `tokenizer_config.json`.")
+    check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS)
     with _TOKENIZING:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 

@@ -62,7 +62,7 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         raise InvalidTypeError(f"`{name}` is {describe(sound)}; {wanted}.")
     if rate is None:
         raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
-    rate = check_integer(f"{name} sampling rate", rate, *RATES, hint="It counts samples a second.")
+    rate = check_integer(f"{name} sampling rate", rate, *RATES)
     if samples.size < 2 or samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
         raise InvalidInputError(f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), T at least 2.")
     full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0

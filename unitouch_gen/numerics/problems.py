@@ -72,11 +72,6 @@ class Problem:
         return min(data.variances.min().sqrt().item() for data in (self.data, self.unconditional) if data is not None)
 
     @property
-    def size(self) -> float:
-        """Root mean square of a coordinate of x_0."""
-        return (self.data.means**2 + self.data.variances).mean().sqrt().item()
-
-    @property
     def is_gaussian(self) -> bool:
         """Whether the flow is linear: Gaussian data, and with guidance both branches."""
         return len(self.data.means) == 1 and (self.unconditional is None or len(self.unconditional.means) == 1)

@@ -73,11 +73,9 @@ def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> fl
 
     In lambda = -log sigma the flow is dx/dlambda = D - x. A step of h leaves out h^2 / 2 |D'| at order 1, and at order
     2 or more at most C h^3 (|D''| + 2 |D'|), with the C of two steps of Adams and Bashforth (5/12 where they are
-    equal). That admits a line through D in log sigma or sigma^k up to k = 2, and through the slope (x - D) / sigma up
-    to k = 1: a line in sigma^k leaves out D'' + k D' of D, and D'' + (k + 1) D' of the slope, whose own derivative is
-    -D' / sigma (k = 0 is log sigma). The exact flow, along which D is known, carries these errors to the end (Hairer,
-    Nørsett & Wanner, Solving Ordinary Differential Equations I, Section II.3). The step to sigma = 0 and roundings are
-    added.
+    equal): that admits a line through D or the slope (x - D) / sigma, in log sigma or a power of sigma. The exact flow,
+    along which D is known, carries these errors to the end (Hairer, Nørsett & Wanner, Solving Ordinary Differential
+    Equations I, Section II.3). The step to sigma = 0 and roundings are added.
     """
     made = prepare_steps(problem.scheduler(), solver=solver, num_inference_steps=num_inference_steps)
     sigmas, higher = torch.tensor(made.sigmas[:-1], dtype=torch.float64), SOLVERS[solver].order > 1
@@ -158,7 +156,8 @@ def solve(
 def bounded(name: str, problem: Problem, **way: Any) -> Case:
     """One run on a problem, with the bound that follows from it."""
     words, run = way.get("solver", f"tolerance {way.get('tolerance', 0):g}"), partial(solve, problem, **way)
-    bound: float | Callable[[], float] = 3 * problem.smallest_deviation / problem.size + 50 * ROUNDING
+    size = (problem.data.means**2 + problem.data.variances).mean().sqrt().item()  # RMS of a coordinate of x_0
+    bound: float | Callable[[], float] = 3 * problem.smallest_deviation / size + 50 * ROUNDING
     reason = "both within 1.5 deviations of a mode"
     if "tolerance" in way:
         bound, reason = partial(within, problem, **way), "tolerance, and the step to sigma 0"

@@ -18,7 +18,6 @@ import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning, first_line
@@ -80,14 +79,10 @@ def pipeline_target(
     """The network of a pipeline under conditions, from some noises each.
 
     Args:
-        pipe: A pipeline of this package.
-        inputs: Arguments of its call that hold a row for each condition.
-        name: To show.
+        inputs: Arguments of the pipeline's call that hold a row for each condition; `options` are more of them.
         seeds: Noises for each condition.
-        guidance_scale: The pipeline's default if left out.
         rtol: Tolerance of the reference. A trained network ripples with the waves of the timestep's embedding, by about
             one percent over some ten levels; far below this tolerance solvers follow every ripple.
-        options: More arguments of the call.
     """
     guidance = Guidance(pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale)
     seen: list[tuple[Tensor, dict[str, Any]]] = []
@@ -184,74 +179,57 @@ def amount(row: Row) -> str:
     return f"tolerance {row['tolerance']:g}" if row["steps"] is None else f"{row['steps']} steps"
 
 
-def machine(device: str = "cpu") -> str:
+def machine() -> str:
     """What timings depend on, in words."""
-    name = platform.processor() or platform.machine()
-    if device.startswith("cuda"):
-        name = torch.cuda.get_device_name()
-    elif (known := Path("/proc/cpuinfo")).exists():
-        lines = known.read_text(encoding="utf-8").splitlines()
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    threads = torch.get_num_threads()
-    return f"{name}, {threads} thread{'s' * (threads > 1)}, torch {torch.__version__}"
+    known = Path("/proc/cpuinfo")
+    lines = known.read_text(encoding="utf-8").splitlines() if known.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    threads = f"{torch.get_num_threads()} threads, torch {torch.__version__}"
+    return f"{(names or [platform.machine()])[0]}, {threads}"
 
 
 # Chart ----------------------------------------------------------------------------------------------------------------
 
 
 def draw_chart(target: Target, rows: Sequence[Row]) -> Figure:
-    """Error against seconds and evaluations, with failures below. Bars are quartiles, the wide band is the Pareto front
-    with its steps or tolerances, a star what a call without options runs."""
+    """Error against seconds and evaluations. Bars are quartiles, the wide band is the Pareto front with its steps or
+    tolerances, a star what a call without options runs."""
     figure = Figure(figsize=(12.6, 5.4), layout="constrained")
-    guidance = f"guidance {target.guidance.scale:g}" if target.guidance.active else "no guidance"
-    title = f"{target.name}: error against run time of {len(target.noise)} samples, {guidance}"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=13)
-    failed = [f"{row['solver']}, {amount(row)}: {row['reason'][:120]}" for row in rows if row["failures"]]
-    lines = [machine(str(target.noise.device)), *(f"\N{MULTIPLICATION X} {line}" for line in failed[:4])]
-    figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=8, color="#555555")
+    figure.suptitle(f"{target.name}, guidance {target.guidance.scale:g}: error against run time")
     left, right = figure.subplots(1, 2, sharey=True)
     _draw_panel(left, target, rows, "seconds", "seconds for one sample")
     _draw_panel(right, target, rows, "evaluations", "evaluations of the network")
     left.set_ylabel("relative RMS error of the latents")
-    right.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8.5)
+    right.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
 
 
 def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, words: str) -> None:
     scale = "log" if good(rows) else "linear"
     axes.set(xscale=scale, yscale=scale, xlabel=words)
+    axes.grid(color="#d9d9d9")
     front = pareto_front(rows, cost)
-    axes.plot([row[cost] for row in front], [row["error"] for row in front], color="#f2c94c", linewidth=11, alpha=0.55,
-              solid_capstyle="round", zorder=1, label="Pareto front")  # fmt: skip
+    axes.plot([row[cost] for row in front], [row["error"] for row in front], "y-", linewidth=11, alpha=0.4,
+              label="Pareto front")  # fmt: skip
     for row in front:
-        text = str(row["steps"] or row["tolerance"])
-        axes.annotate(text, (row[cost], row["error"]), (-7, -7), textcoords="offset points", ha="right", va="top",
-                      fontsize=7.5, zorder=7)  # fmt: skip
+        axes.annotate(str(row["steps"] or row["tolerance"]), (row[cost], row["error"]))
     for solver in dict.fromkeys(row["solver"] for row in rows):
-        colour = f"C{NAMES.index(solver)}"  # the same on every chart
         known = sorted((row for row in good(rows) if row["solver"] == solver), key=lambda row: row[cost])
         x, low, error, high = ([row[key] for row in known] for key in (cost, "error_low", "error", "error_high"))
-        axes.errorbar(x, error, yerr=(np.subtract(error, low), np.subtract(high, error)), fmt="o-", markersize=5,
-                      color=colour, ecolor=(colour, 0.45), capsize=2, zorder=3, label=solver)  # fmt: skip
+        bars, colour = (np.subtract(error, low), np.subtract(high, error)), f"C{NAMES.index(solver)}"
+        axes.errorbar(x, error, yerr=bars, fmt="o-", color=colour, capsize=2, label=solver)
         for row in known:
             if row["default"]:
-                axes.plot(row[cost], row["error"], "*", markersize=19, color=colour, markeredgecolor="white", zorder=5)
+                axes.plot(row[cost], row["error"], "*", markersize=19, color=colour)
     if target.own_error > 0.03 * min((row["error"] for row in good(rows)), default=math.inf):
         words = f"reference's own error {target.own_error:.0e}"
-        axes.axhline(target.own_error, color="#444444", linestyle="--", linewidth=1.1, label=words)
-    axes.grid(color="#d9d9d9")
-    axes.spines[["top", "right"]].set_visible(False)
-    if good(rows):
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter("")
+        axes.axhline(target.own_error, color="#444444", linestyle="--", label=words)
 
 
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
     """Writes `results.json` and `chart.png`."""
     values = {"target": target.name, "guidance_scale": target.guidance.scale, "own_error": target.own_error,
-              "machine": machine(str(target.noise.device)), "rows": list(rows)}  # fmt: skip
+              "machine": machine(), "rows": list(rows)}  # fmt: skip
     picture = io.BytesIO()
     draw_chart(target, rows).savefig(picture, format="png", dpi=160, facecolor="white")
     contents: dict[str, str | bytes] = {"results.json": json.dumps(values, indent=1), "chart.png": picture.getvalue()}

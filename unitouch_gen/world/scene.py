@@ -15,8 +15,8 @@ from unitouch_gen.errors import (
     check_choice,
     check_integer,
     check_kind,
-    check_tensor,
     check_texts,
+    describe,
     first_line,
 )
 from unitouch_gen.world.attributes import contact_attributes
@@ -175,7 +175,7 @@ def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
     return list(found.values())
 
 
-def _numbers(label: str, values: object, count: int | str = "N", most: int | None = None) -> Tensor:
+def _numbers(label: str, values: object, count: int | None = None, most: float = math.inf) -> Tensor:
     """One part of the names of N contacts, int64 (N,), from 0 to `most`."""
     try:
         numbers = torch.as_tensor(values)
@@ -183,7 +183,10 @@ def _numbers(label: str, values: object, count: int | str = "N", most: int | Non
         raise InvalidTypeError(
             f"`{label}` cannot be read as integers ({first_line(error)}); pass one for each contact."
         ) from error
-    check_tensor(label, numbers, count, integers=True, finite=False, hint="Pass one for each contact, such as [3].")
-    for end in numbers.long().aminmax():
+    if numbers.is_sparse or numbers.dtype == torch.bool or not torch.can_cast(numbers.dtype, torch.int64):
+        raise InvalidTypeError(f"`{label}` is {describe(values)}; it has to hold integers.")
+    if numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
+        raise InvalidInputError(f"`{label}` is {describe(values)}; pass one for each contact, such as [3].")
+    for end in numbers.aminmax():
         check_integer(label, int(end), 0, most)
     return numbers.long()
