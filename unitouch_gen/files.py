@@ -154,6 +154,8 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         return folder
+    if os.path.exists(folder):
+        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; pass one, or a repository id.")
     from huggingface_hub import snapshot_download
 
     known = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")

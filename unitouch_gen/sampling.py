@@ -143,20 +143,11 @@ def prepare_steps(
 ) -> Steps:
     """Validates the step arguments of a call, before any network runs.
 
-    Args:
-        scheduler: The pipeline's own, never changed. Without `solver` and `tolerance` a copy of it runs; otherwise only
-            its noise levels and prediction type are used.
-        solver: A name in `SOLVERS`.
-        num_inference_steps: At most the number of training timesteps; default 50.
-        timesteps, sigmas: Custom steps in its place: falling timesteps, or falling noise levels that end in 0.
-        tolerance: Relative RMS error of the latents, from 1e-5 to 1, in place of all of these.
-        max_evaluations: Maximum network evaluations with a tolerance; default 1000.
-        eta: DDIM eta, from 0 to 1.
-        init_strength: Share of the steps to run (img2img strength): 1 runs all of them, 0 only the last one.
-        device: Device of the scheduler's timesteps.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the steps are impossible, or arguments exclude each other.
+    One of `num_inference_steps` (default 50), `timesteps`, `sigmas`, which end in 0, and `tolerance`, a relative RMS
+    error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of the pipeline's own
+    scheduler runs; otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of
+    a tolerance, `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): 1 runs all of them, 0 the
+    last one. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
@@ -289,20 +280,14 @@ def sample(
     Args:
         network: Denoising network with its conditioning bound; called on 2 B states while guidance is active.
         noise: Unit-variance noise, (B, C, h, w).
-        steps: Steps of `prepare_steps`; may be used again.
         report: Filled in: solver, numbers of steps and evaluations, and a return code for each sample.
-        guidance: Guidance at the start.
         init: Latents to start from, (B, C, h, w) (SDEdit; Meng et al., 2022).
         generator: One, or one for each sample, for DDIM and schedulers that draw noise.
-        throw: Raise on a non-finite or unfinished sample; otherwise go on with the others.
+        throw: Raise `NonFiniteError` or `NotConvergedError` where a sample fails; otherwise go on with the others.
         on_step: Called as `on_step(step, timestep, latents, run)` after each step (diffusers schedulers: after each
             evaluation). `latents` are variance-preserving (diffusers: in the scheduler's scale). It may return new
             latents, and set `run.guidance` and `run.interrupted`.
         progress: Called with the finished share of the run.
-
-    Raises:
-        NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        NotConvergedError: If a tolerance is not reached and `throw` is set.
     """
     noise, init = noise.float(), None if init is None else init.float()
     report.solver, report.codes = steps.solver, [ReturnCode.SUCCESS] * len(noise)

@@ -201,7 +201,8 @@ def described(picture: Picture, report: "RunReport", place: int) -> dict[str, An
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by the options of a command, saves each when its call has ended, and prints what came of them."""
-    given, reports, rows = context.params, list["RunReport"](), list[dict[str, Any]]()
+    given, rows = context.params, list[dict[str, Any]]()
+    reports: list[RunReport] = []
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
     processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
@@ -227,5 +228,5 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     cells = [[Path(row.get(name) or "-").name for name in columns] for row in rows]
     options.print_table([noun, *columns[1:]], cells)
     echo(f"{noun.capitalize()}s are in {first.parent}" if len(rows) > 1 else f"The {noun} is {first}")
-    for report in reports:
-        echo(f"Run report: {report}")
+    seconds = sum(sum(report.seconds.values()) for report in reports)
+    echo(f"Run report: {reports[-1]}" + (f"; {len(reports)} such calls, {seconds:.1f} s" if len(reports) > 1 else ""))
