@@ -120,7 +120,7 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     if isinstance(value, bool) or not isinstance(value, Real):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number.")
     try:
-        fits = math.isfinite(value) and low <= value <= high
+        fits = math.isfinite(value) and low <= value <= high  # type: ignore[operator]
     except OverflowError:  # of integers beyond the range of floats
         fits = False
     if not fits:

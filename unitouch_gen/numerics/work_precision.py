@@ -18,6 +18,7 @@ import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning, first_line
@@ -224,6 +225,11 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
     if target.own_error > 0.03 * min((row["error"] for row in good(rows)), default=math.inf):
         words = f"reference's own error {target.own_error:.0e}"
         axes.axhline(target.own_error, color="#444444", linestyle="--", label=words)
+    if good(rows):
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
