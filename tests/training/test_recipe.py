@@ -119,7 +119,7 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line(name: str, override: str, 
     [
         (b"data: {image_size: 1}", "`trainer` is missing in the recipe"),
         (b"trainer: 3", "`trainer` is 3; it has to be a valid dictionary"),
-        (b"trainer: {steps: [1", "cannot be read as YAML"),
+        (b"trainer: {steps: [1", "cannot be read"),
         (b"data: {base: taste}", r"`data\.base` names 'taste', which does not exist"),
     ],
 )
