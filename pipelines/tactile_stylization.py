@@ -42,9 +42,7 @@ class LayoutHold:
         schedule, prediction_type: Of the network.
     """
 
-    def __init__(
-        self, photo: Tensor, cells: int, keep_colours: bool, schedule: NoiseSchedule, prediction_type: str
-    ):
+    def __init__(self, photo: Tensor, cells: int, keep_colours: bool, schedule: NoiseSchedule, prediction_type: str):
         self.photo, self.keep_colours = photo.float(), keep_colours
         share = min(cells / min(photo.shape[-2:]), 1.0)
         self.grid = [max(round(share * side), 1) for side in photo.shape[-2:]]
@@ -174,7 +172,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             embeds = self._mixed(mixture, mix, strength, bridge, report, throw)
 
         # 3. Encode the photo's own latents
-        photo = None
+        photo: Any = None
         if init_strength < 1.0 or layout is not None:
             with report.stage("photo latents"):
                 photo = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
@@ -182,7 +180,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         # 4. Generate from the mixed embedding
         hold = None
-        if schedule is not None:
+        if layout is not None and schedule is not None:
             hold = LayoutHold(photo, layout, keep_colours, schedule, self.scheduler.config.prediction_type)
         init = photo if init_strength < 1.0 else None
         images = self._generate(settings, embeds, noise_level, prompts, report, init, hold)

@@ -76,9 +76,7 @@ def test_networks_are_of_the_dtype_asked_for(models):
 def test_a_photo_is_restyled_by_each_touch(here, run, pipes):
     rows = run("stylize in/dark.png in/dark.png in/bright.png -o out")["pictures"]
     assert [Path(row["picture"]).name for row in rows] == ["dark-dark.png", "dark-bright.png"]
-    alone = pipes["stylize"](
-        "in/dark.png", "in/bright.png", generator=torch.Generator().manual_seed(0)
-    )
+    alone = pipes["stylize"]("in/dark.png", "in/bright.png", generator=torch.Generator().manual_seed(0))
     assert abs(np.asarray(alone.images[0], dtype=int) - pixels("out/dark-bright.png")).max() <= 1
 
 
