@@ -33,7 +33,7 @@ class LayoutHold:
     """Holds the layout of photos while a network denoises, as ILVR does (Choi et al., 2021, Equation 8).
 
     The coarse part F of what the network predicts of the clean latents becomes that of the photo's latents:
-    D' = D + F(photo - D). As it is the denoiser that changes, every solver, adaptive steps and guidance run as they are.
+    D' = D + F(photo - D). Only the denoiser changes: every solver, adaptive steps and guidance run as they are.
 
     Args:
         photo: Latents (B, C, h, w).

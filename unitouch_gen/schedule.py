@@ -30,7 +30,8 @@ class NoiseSchedule:
         name = type(scheduler).__name__
         if not hasattr(scheduler, "alphas_cumprod"):
             raise InvalidInputError(
-                f"`scheduler` is {name}, which has no noise levels to choose from; leave `solver`, `tolerance` and `layout` out (None)."
+                f"`scheduler` is {name}, which has no noise levels to choose from; pass no `solver`, "
+                "`tolerance` or `layout`."
             )
         alphas = scheduler.alphas_cumprod.detach().cpu().clone()
         if alphas[-1] < 1e-12:  # zero terminal SNR; 2^-24 as in diffusers' `EulerDiscreteScheduler`
