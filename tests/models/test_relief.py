@@ -36,14 +36,14 @@ def alike(a: Tensor, b: Tensor) -> float:
     return torch.corrcoef(both)[0, 1].item()
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("size", [(128, 128), (64, 64), (96, 160)])
-def test_slopes_and_heights_come_back_whatever_the_lamps_are(seed: int, size: tuple[int, int]) -> None:
-    heights, slopes = bumps(seed, *size)
-    found = relief(shaded(slopes, seed))[0]
-    assert alike(found[0], slopes[0]) > 0.95 and alike(found[1], slopes[1]) > 0.95
-    assert alike(found[2], heights) > 0.8  # what is wider than the window is left out
-    assert all(0.4 < deviation < 2.5 for deviation in found.flatten(1).std(dim=1))
+def test_slopes_and_heights_come_back_whatever_the_lamps_are(size: tuple[int, int]) -> None:
+    for seed in range(4):
+        heights, slopes = bumps(seed, *size)
+        found = relief(shaded(slopes, seed))[0]
+        assert alike(found[0], slopes[0]) > 0.95 and alike(found[1], slopes[1]) > 0.95
+        assert alike(found[2], heights) > 0.8  # what is wider than the window is left out
+        assert all(0.4 < deviation < 2.5 for deviation in found.flatten(1).std(dim=1))
 
 
 def test_other_lamps_and_less_contrast_give_the_same_relief() -> None:
