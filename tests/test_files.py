@@ -7,10 +7,11 @@ import sys
 import textwrap
 import time
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import pytest
-import yaml
+from yaml import safe_load
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.files import (
@@ -60,17 +61,14 @@ def test_a_link_stays_one(tmp_path):
     assert (tmp_path / "link").is_symlink() and file.read_text() == "new"
 
 
-@pytest.mark.parametrize(
-    "write", [lambda file: write_file("output", file, ""), lambda file: check_writable("output", file)]
-)
-def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(tmp_path, write):
+def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(tmp_path):
     check_writable("output", tmp_path / "new" / "a.txt")
     assert not list(tmp_path.iterdir())
     (tmp_path / "folder").mkdir()
     write_file("output", tmp_path / "file", "")
-    for place in (tmp_path / "folder", tmp_path / "file" / "a.txt", Path(os.devnull)):
+    for place, write in product(("folder", "file/a.txt"), (check_writable, partial(write_file, content=""))):
         with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*Nothing was changed"):
-            write(place)
+            write("output", tmp_path / place)
 
 
 def test_a_folder_takes_the_place_of_another_and_keeps_what_is_beside(tmp_path):
@@ -85,20 +83,18 @@ def test_a_folder_takes_the_place_of_another_and_keeps_what_is_beside(tmp_path):
     assert (tmp_path / "model" / "config.json").read_text() == "new"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "left"),
-    [
+def test_weights_of_before_go_where_a_reader_could_take_them_for_the_new_ones(tmp_path):
+    for number, (old, new, left) in enumerate([
         ("model.safetensors", "model-00001-of-00002.safetensors", False),
         ("model.safetensors.index.json", "model.safetensors", False),
         ("model.safetensors", "model.fp16.safetensors", True),
         ("model.fp16-00001-of-00002.safetensors", "model.fp16.safetensors", False),
-    ],
-)
-def test_weights_of_before_go_where_a_reader_could_take_them_for_the_new_ones(tmp_path, old, new, left):
-    write_file("x", tmp_path / "model" / old, "old")
-    with writing_folder("x", tmp_path / "model") as place:
-        write_file("x", place / new, "new")
-    assert names(tmp_path / "model") == {new} | ({old} if left else set())
+    ]):  # fmt: skip
+        folder = tmp_path / str(number)
+        write_file("x", folder / old, "old")
+        with writing_folder("x", folder) as place:
+            write_file("x", place / new, "new")
+        assert names(folder) == {new} | ({old} if left else set())
 
 
 def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
@@ -124,40 +120,35 @@ def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("check", "place", "error"),
-    [
-        *((as_path, place, error) for place, error in ((3, InvalidTypeError), ("", InvalidInputError))),
-        (as_path, "a\0b", InvalidInputError),
-        *((partial(check_file, what="an image file"), place, InvalidInputError)
-          for place in ("missing.png", "https://example.org/a.png", ".", "a" * 5000)),
-        *((local_folder, place, InvalidInputError) for place in ("./missing", "a/b/c", "no repository", __file__)),
-    ],
-)  # fmt: skip
-def test_what_is_no_path_file_or_folder(check, place, error):
-    with pytest.raises(error, match=r"^`image`"):
-        check("image", place)
+def test_what_is_no_path_file_or_folder():
+    files = ("missing.png", "https://example.org/a.png", ".", "a" * 5000)
+    folders = ("./missing", "a/b/c", "no repository", __file__)
+    with pytest.raises(InvalidTypeError, match=r"^`image`"):
+        as_path("image", 3)
+    image = partial(check_file, what="an image file")
+    for check, places in ((as_path, ("", "a\0b")), (image, files), (local_folder, folders)):
+        for place in places:
+            with pytest.raises(InvalidInputError, match=r"^`image`"):
+                check("image", place)
 
 
 def test_numbers_in_names_count_as_numbers():
     assert sorted(["10.png", "2.png", "a1", "a10", "a9"], key=natural) == ["2.png", "10.png", "a1", "a9", "a10"]
 
 
-@pytest.mark.parametrize(
-    ("parse", "text"),
-    [(json.loads, "{"), (json.loads, "[1]"), (json.loads, "\xff"), (yaml.safe_load, "a: ["), (yaml.safe_load, "- 1"),
-     (yaml.safe_load, "a: !!python/object/apply:os.system ['true']")],
-)  # fmt: skip
-def test_settings_that_cannot_be_read(tmp_path, parse, text):
-    (tmp_path / "a").write_text(text, encoding="latin-1")
-    with pytest.raises(InvalidInputError, match="`recipe` names"):
-        read_settings("recipe", tmp_path / "a", parse)
+def test_settings_that_cannot_be_read(tmp_path):
+    yaml = ("a: [", "- 1", "a: !!python/object/apply:os.system ['true']")
+    for parse, texts in ((json.loads, ("{", "[1]", "\xff")), (safe_load, yaml)):
+        for text in texts:
+            (tmp_path / "a").write_text(text, encoding="latin-1")
+            with pytest.raises(InvalidInputError, match="`recipe` names"):
+                read_settings("recipe", tmp_path / "a", parse)
 
 
 def test_settings_are_read(tmp_path):
     write_file("x", tmp_path / "a.json", json.dumps({"a": [1, 2]}))
     write_file("x", tmp_path / "a.yaml", "a: [1, 2]")
-    by_yaml = read_settings("x", tmp_path / "a.yaml", yaml.safe_load)
+    by_yaml = read_settings("x", tmp_path / "a.yaml", safe_load)
     assert read_settings("x", tmp_path / "a.json") == by_yaml == {"a": [1, 2]}
 
 

@@ -11,10 +11,10 @@ from unitouch_gen.training.data import heldout
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
 
 
-@pytest.fixture
-def pictured(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Touches of four materials of the world, with pictures of the same contacts, by `gelsight`."""
-    sensor, folder = SENSORS["gelsight"], tmp_path / "pictured"
+    sensor, folder = SENSORS["gelsight"], tmp_path_factory.mktemp("data") / "pictured"
     names = [np.repeat(range(4), 12), np.tile(np.repeat(range(6), 2), 4), np.tile(range(2), 24)]
     scene = World(0, image_size=32).render(*map(list, names), modalities=("image", "touch"), sensors=[sensor])
     rows = ["touch,picture,object,material,split,sensor"]
@@ -64,7 +64,7 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
     assert {f"{source}: CVTP, in domain" for source in sources} < set(rows)
 
 
-@pytest.mark.parametrize(("words", "change", "said"), [
+REFUSED = [  # words of a command, what is changed in the labels, and what is said
     (("taste",), None, "`table` is 'taste'"),
     (("material", "--data", "nowhere"), None, "nowhere"),
     (("material", "--seeds", "0"), None, "'--seeds'"),
@@ -78,15 +78,18 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
     (("x-to-touch",), ("gelsight", "mine"), "felt by sensors other than gelsight, digit"),
     (("x-to-touch",), ("test", "val"), "and no 'test'"),
     (("x-to-touch", "--each", "4"), None, "needs 18"),
-])  # fmt: skip
-def test_what_cannot_be_measured_is_one_line_before_a_file_is_read(
-    command, models, here, refused, pictured, words, change, said
-):
-    for image in pictured.rglob("*.png"):
-        image.write_bytes(b"no image")
-    labels = pictured / "labels.csv"
-    labels.write_text(labels.read_text().replace(*change or ("", "")))
-    refused(command("evaluate", "--data", pictured, "--model", models["x-to-touch"], *words), said)
+]  # fmt: skip
+
+
+def test_what_cannot_be_measured_is_one_line_before_a_file_is_read(command, models, here, refused, pictured):
+    for name in pictured.rglob("*.png"):
+        file = here / "pictured" / name.relative_to(pictured)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"no image")
+    for words, change, said in REFUSED:
+        labels = (pictured / "labels.csv").read_text().replace(*change or ("", ""))
+        (here / "pictured" / "labels.csv").write_text(labels)
+        refused(command("evaluate", "--data", "pictured", "--model", models["x-to-touch"], *words), said)
 
 
 def test_tables_are_not_replaced_unasked(command, refused, tmp_path):

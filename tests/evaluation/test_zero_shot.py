@@ -90,13 +90,11 @@ def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(classifier, ima
     assert banked.name(heard, "audio", NAMES) == classifier.name(heard, "audio", NAMES)
 
 
-@pytest.mark.parametrize(("unknown", "words"), [
-    (None, "brick 80%, tile 12%"),
-    ("unlike anything known", "unlike anything known (nearest: brick)"),
-    ("nothing is touched", "nothing is touched"),
-])  # fmt: skip
-def test_what_is_known_is_said_in_words(unknown, words):
-    assert str(Named({"brick": 0.8, "tile": 0.12}, unknown)) == words
+def test_what_is_known_is_said_in_words():
+    shares, unlike = {"brick": 0.8, "tile": 0.12}, "unlike anything known"
+    assert str(Named(shares, None)) == "brick 80%, tile 12%"
+    assert str(Named(shares, unlike)) == f"{unlike} (nearest: brick)"
+    assert str(Named(shares, "nothing is touched")) == "nothing is touched"
 
 
 def test_only_the_best_are_named(classifier, images):
@@ -130,17 +128,15 @@ def test_the_processor_is_read_from_the_models_folder(classifier, images, tmp_pa
         ZeroShotTouchClassifier(model, processor, EmbeddingBank.of(torch.eye(8)))
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    ({"sensor": "skin"}, "`sensor` is 'skin'"),
-    ({"labels": ["wood"]}, "`labels` is"),
-    ({"labels": ["wood", "wood"]}, "each once"),
-    ({"labels": ["wood", " "]}, "none of them blank"),
-    ({"labels": [1, 2]}, "`labels`"),
-    ({"template": "feels like"}, "write {} once"),
-    ({"template": "{} and {}"}, "write {} once"),
-    ({"template": "{0}"}, "write {} once"),
-    ({"template": 3}, "`template`"),
-])  # fmt: skip
-def test_bad_input_is_refused_by_name(arguments, said, classifier, images):
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=said):
-        classifier(images, **arguments)
+def test_bad_input_is_refused_by_name(classifier, images):
+    for arguments, said in (
+        ({"sensor": "skin"}, "`sensor` is 'skin'"),
+        ({"labels": ["wood"]}, "`labels` is"),
+        ({"labels": ["wood", "wood"]}, "each once"),
+        ({"labels": ["wood", " "]}, "none of them blank"),
+        ({"labels": [1, 2]}, "`labels`"),
+        *(({"template": bad}, "write {} once") for bad in ("feels like", "{} and {}", "{0}")),
+        ({"template": 3}, "`template`"),
+    ):
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=said):
+            classifier(images, **arguments)

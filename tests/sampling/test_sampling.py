@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -45,9 +46,8 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
 # What a call may say of its steps -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
+def test_steps_that_cannot_be_made_are_refused():
+    for arguments, words in (
         ({"scheduler": "ddim"}, "`scheduler` is 'ddim'"),
         ({"solver": "eulr"}, r"`solver` is 'eulr'; .*'ddim'.* Did you mean 'euler'\?"),
         ({"solver": "ddim", "scheduler": FlowMatchEulerDiscreteScheduler()}, "has no noise levels"),
@@ -75,11 +75,9 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
         ({"init_strength": -1.0}, "`init_strength` is -1"),
         ({"scheduler": DDIMScheduler(steps_offset=1), "num_inference_steps": 1000}, "1000, with .* timestep 1000 of"),
         ({"scheduler": EulerDiscreteScheduler(timestep_spacing="leading"), "num_inference_steps": 1}, "timestep 0 of"),
-    ],
-)
-def test_steps_that_cannot_be_made_are_refused(arguments, words):
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
-        prepare_steps(**{"scheduler": OWN, **arguments})
+    ):
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
+            prepare_steps(**{"scheduler": OWN, **arguments})
 
 
 def test_steps_may_be_chosen_one_by_one():
@@ -92,11 +90,10 @@ def test_steps_may_be_chosen_one_by_one():
     assert (by_sigma.sigmas, by_sigma.count) == ([9.0, 2.0, 0.0], 2)
 
 
-@pytest.mark.parametrize(("strength", "count"), [(1.0, 10), (0.26, 3), (0.0, 1)])
-@pytest.mark.parametrize("solver", [None, "heun"])
-def test_strength_is_the_share_of_steps_that_is_made(solver, strength, count):
-    steps = prepare_steps(OWN, solver=solver, num_inference_steps=10, init_strength=strength)
-    assert steps.count == count == (len(steps.timesteps) if solver is None else len(steps.sigmas) - 1)
+def test_strength_is_the_share_of_steps_that_is_made():
+    for solver, (strength, count) in product((None, "heun"), ((1.0, 10), (0.26, 3), (0.0, 1))):
+        steps = prepare_steps(OWN, solver=solver, num_inference_steps=10, init_strength=strength)
+        assert steps.count == count == (len(steps.timesteps) if solver is None else len(steps.sigmas) - 1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------
@@ -277,8 +274,7 @@ def test_a_diverged_sample_does_not_hold_steps_to_a_tolerance_up():
     assert report.evaluations <= alone.evaluations + 2 and relative_rms(latents, whole)[1:].max() < 0.05
 
 
-@pytest.mark.parametrize("solver", [None, "dpm++2m"])
-@pytest.mark.parametrize(("size", "code"), [(0.5, SUCCESS), (2.0, DIVERGED)])
+@pytest.mark.parametrize(("solver", "size", "code"), [(None, 2.0, DIVERGED), ("dpm++2m", 0.5, SUCCESS)])
 def test_states_are_judged_as_networks_see_them(solver, size, code):
     """Also of a diffusers scheduler that keeps x = z sqrt(1 + sigma^2)."""
     shown = []

@@ -190,9 +190,12 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
         Stage("touch", KINDS["touch"], **given)
 
 
-@pytest.mark.parametrize(
-    ("name", "words", "message"),
-    [
+def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
+    joint: str, vae: str, monkeypatch: Any, capsys: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for name, words, message in (
         ("image_text", "--set model.audio_config.size=3", "In `model`, `size` is unknown"),
         ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
@@ -205,15 +208,9 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
         ("touch", "--joint {joint} --set data.drawn.sensors=[digit] --set data.grasps=[]", "`sampler.sigma` is 0.75"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
-    ],
-)
-def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
-    name: str, words: str, message: str, joint: str, vae: str, monkeypatch: Any, capsys: Any, tmp_path: Path
-) -> None:
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    main = import_module(f"unitouch_gen.training.{name}").main
-    with pytest.raises(SystemExit, match="2"):
-        run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error and list((tmp_path / "here").iterdir()) == []
+    ):
+        main = import_module(f"unitouch_gen.training.{name}").main
+        with pytest.raises(SystemExit, match="2"):
+            run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
+        (error,) = capsys.readouterr().err.splitlines()
+        assert message in error and list((tmp_path / "here").iterdir()) == []
