@@ -65,22 +65,18 @@ def described(text: str, url: str) -> str:
 
 
 without_setup = pytest.mark.skipif(not (CHECKOUT / "setup.py").is_file(), reason="there is no checkout here")
-URL = "https://host.example/owner/unitouch_gen"
 
 
 @without_setup
-@pytest.mark.parametrize("url", ["", URL])
-def test_the_readme_becomes_one_without_files_beside_it(url):
+def test_the_readme_becomes_one_without_files_beside_it():
     """All that it links to, at the repository's address, or what has an address anyway."""
-    text = (CHECKOUT / "README.md").read_text()
-    absolute = re.compile("https?://")
-
-    def placed(target: str) -> str:
-        folder = "raw" if target.endswith(".png") else "blob"
-        return target if absolute.match(target) else f"{url}/{folder}/HEAD/{target}"
-
-    expected = [placed(target) for target in targets(text) if url or absolute.match(target)]
-    assert targets(described(text, url)) == expected
+    text, url = (CHECKOUT / "README.md").read_text(), "https://host.example/owner/unitouch_gen"
+    absolute = [target for target in targets(text) if re.match("https?://", target)]
+    expected = [
+        target if target in absolute else f"{url}/{'raw' if target.endswith('.png') else 'blob'}/HEAD/{target}"
+        for target in targets(text)
+    ]
+    assert targets(described(text, url)) == expected and targets(described(text, "")) == absolute
 
 
 @without_setup
@@ -99,24 +95,14 @@ def test_an_address_that_is_none_is_refused():
     assert done.returncode and "UNITOUCH_GEN_URL is 'host/owner'" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "py.typed",
-        "examples/gelsight_brick.png",
-        "examples/photos/wood.png",
-        "examples/sounds/metal.wav",
-        "training/recipes/touch.yaml",
-        "weights/cards/stylization.jpg",
-        "weights/family.json",
-        "weights/joint/model.safetensors",
-        "weights/joint/tokenizer.json",
-        "weights/touch-classifier/model.safetensors",
-        "world/calibrated_sensors.json",
-    ],
-)
-def test_data_files_are_installed(name):
-    assert files("unitouch_gen").joinpath(name).is_file()
+def test_data_files_are_installed():
+    for name in (
+        "py.typed", "examples/gelsight_brick.png", "examples/photos/wood.png", "examples/sounds/metal.wav",
+        "training/recipes/touch.yaml", "weights/cards/stylization.jpg", "weights/family.json",
+        "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
+        "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
+    ):  # fmt: skip
+        assert files("unitouch_gen").joinpath(name).is_file(), name
 
 
 def test_examples_go_by_what_they_are_of():
@@ -149,19 +135,14 @@ def test_training_runs_as_a_module(tmp_path):
     assert "usage" in run(["-m", "unitouch_gen.training.touch", "--help"], tmp_path).lower()
 
 
-@pytest.mark.parametrize(
-    ("name", "inputs"),
-    [
-        ("touch-to-image", {"touch": unitouch_gen.example("brick")}),
-        ("x-to-touch", {"text": "rough brick"}),
-        (
-            "stylization",
-            {"image": unitouch_gen.example("wood", "image"), "touch": unitouch_gen.example("gravel")},
-        ),
-    ],
-)
-def test_built_in_pipelines_run(name, inputs):
-    pipe = unitouch_gen.tiny(name)
-    pipe.set_progress_bar_config(disable=True)
-    output = pipe(**inputs, num_inference_steps=2)
-    assert output.images[0].size == (128, 128) and output.report.success
+def test_built_in_pipelines_run():
+    touch, photo = unitouch_gen.example("brick"), unitouch_gen.example("wood", "image")
+    for name, inputs in {
+        "touch-to-image": {"touch": touch},
+        "x-to-touch": {"text": "rough brick"},
+        "stylization": {"image": photo, "touch": touch},
+    }.items():
+        pipe = unitouch_gen.tiny(name)
+        pipe.set_progress_bar_config(disable=True)
+        output = pipe(**inputs, num_inference_steps=2)
+        assert output.images[0].size == (128, 128) and output.report.success

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ import torch
 from PIL import Image
 
 from drawing import MARGIN, draw_grid, font, written
+from tests.helpers.processes import Child, finished, script
 from unitouch_gen import weights
 from unitouch_gen.pipelines.tiny import PIPELINES
 
@@ -66,14 +65,12 @@ def test_a_place_may_be_empty():
     assert red(draw_grid(rows, labels=["", "a"], titles=["", "b"], side=32)).sum() == 2 * 32**2
 
 
-@pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
-def test_no_sample_replaces_a_tracked_picture_unasked(file):
+def test_no_sample_replaces_a_tracked_picture_unasked():
     """Each writes into the ignored folder `outputs`, unless it is told where."""
-    ignored = (SAMPLES.parent / ".gitignore").read_text().splitlines()
-    written = re.findall(r'"--output", .*default=Path\("([^"]+)"\)', file.read_text())
-    assert "outputs/" in ignored
-    assert all(path.startswith("outputs/") for path in written)
-    assert written or file.stem in NOT_RUN
+    assert "outputs/" in (SAMPLES.parent / ".gitignore").read_text().splitlines()
+    for file in SAMPLES.glob("*.py"):
+        places = re.findall(r'"--output", .*default=Path\("([^"]+)"\)', file.read_text())
+        assert all(path.startswith("outputs/") for path in places) and (places or file.stem in NOT_RUN), file.name
 
 
 @pytest.mark.wheel
@@ -82,19 +79,16 @@ def test_no_sample_replaces_a_tracked_picture_unasked(file):
 def test_samples_run(file, tmp_path):
     if file.stem in NOT_RUN:
         pytest.skip(NOT_RUN[file.stem])
-    picture = tmp_path / "picture.png"
-    command = [sys.executable, file, "--output", picture]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    assert picture.is_file()
+    finished(Child(script, file.read_text(), "--output", "picture.png", folder=tmp_path))
+    assert (tmp_path / "picture.png").is_file()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PIPELINES)
 def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
     """Within less than another seed makes (1.8 and more): after new weights, they have to be drawn anew."""
-    command = [sys.executable, SAMPLES / "card_pictures.py", "--pipeline", name, "--output", tmp_path / "drawn.jpg"]
-    subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=600, check=True)
+    words = ["--pipeline", name, "--output", "drawn.jpg"]
+    finished(Child(script, (SAMPLES / "card_pictures.py").read_text(), *words, folder=tmp_path))
     pictures = [Image.open(file) for file in (tmp_path / "drawn.jpg", weights.CARDS / f"{name}.jpg")]
     drawn, shown = (np.asarray(picture, dtype=float) for picture in pictures)
     assert np.abs(drawn - shown).mean() < 1
@@ -105,6 +99,4 @@ def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
 @pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.ipynb")), ids=lambda file: file.stem)
 def test_notebooks_run_from_top_to_bottom(file, tmp_path):
     cells = ["".join(cell["source"]) for cell in json.loads(file.read_text())["cells"] if cell["cell_type"] == "code"]
-    command = [sys.executable, "-c", "\n".join(cells)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
+    finished(Child(script, "\n".join(cells), folder=tmp_path))

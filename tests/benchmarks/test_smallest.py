@@ -1,24 +1,18 @@
 """Each benchmark at its smallest size."""
 
-import csv
-import io
 import json
 import shutil
-import zipfile
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler
-from PIL import Image
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
 from tests.benchmarks import quality
 from tests.benchmarks.error_and_time import cost_figures, our_call, speedup_figures, usual_call
 from tests.benchmarks.files_entered import functions_entered
-from tests.benchmarks.joint_space import UNITS, JointSpace, two_digits
 from tests.benchmarks.tables import MARKS, ROOT, write_pages
 from tests.benchmarks.world import physics_figures
 from tests.helpers.components import make_components
@@ -97,22 +91,6 @@ def test_each_request_does_less_than_everything() -> None:
 
 
 # Models ---------------------------------------------------------------------------------------------------------------
-
-
-def test_random_pictures_are_not_known_again_under_another_digit(tmp_path):
-    rows = [{"file": f"{unit}_{number}.png", "unit": unit, "object": f"object {number % 3}"}
-            for unit in UNITS for number in range(24)]  # fmt: skip
-    random, table = np.random.default_rng(0), io.StringIO()
-    writer = csv.DictWriter(table, rows[0])
-    writer.writeheader()
-    writer.writerows(rows)
-    with zipfile.ZipFile(tmp_path / "digits.zip", "w") as box:
-        box.writestr("index.csv", table.getvalue())
-        for row in rows:
-            Image.fromarray(random.integers(0, 256, (64, 64, 3), np.uint8)).save(data := io.BytesIO(), "png")
-            box.writestr(row["file"], data.getvalue())
-    for found in two_digits(JointSpace.from_folders([weights.JOINT]), tmp_path / "digits.zip").values():
-        assert abs(found["auc"] - 0.5) < 0.2
 
 
 @pytest.mark.slow

@@ -133,6 +133,12 @@ def command(*words: str) -> None:
     main()
 
 
+def script(code: str, *words: str) -> None:
+    """Code as a program with arguments."""
+    sys.argv = ["script", *words]
+    exec(compile(code, "script", "exec"), {"__name__": "__main__"})  # noqa: S102
+
+
 def save_numbered(folder: str, number: int) -> None:
     """A pipeline whose weights are those of `make_components` plus a number."""
     import torch

@@ -30,9 +30,9 @@ def components() -> dict:
 
 
 @pytest.fixture
-def x_components(components: dict) -> dict:
-    shared = {name: components[name] for name in ("unitouch", "processor", "scheduler")}
-    return {**shared, **copy.deepcopy(_X_TO_TOUCH)}
+def x_components() -> dict:
+    shared = {name: _COMPONENTS[name] for name in ("unitouch", "processor", "scheduler")}
+    return copy.deepcopy({**shared, **_X_TO_TOUCH})
 
 
 @pytest.fixture

@@ -200,9 +200,3 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
         network.register_forward_hook(lambda *args: args[-1] * huge)
     output = call(throw=False)
     assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1
-
-
-def test_latents_beyond_all_pictures(call):
-    output = call(callback_on_step_end=put(50.0, row=0), throw=False, output_type="latent", num_inference_steps=3)
-    assert output.report.codes == [ReturnCode.DIVERGED, ReturnCode.SUCCESS]
-    assert len(output.images) == 2 and "diverged" in str(output.report)

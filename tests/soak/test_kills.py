@@ -41,11 +41,11 @@ def test_a_pipeline_is_the_old_or_the_new_one_after_kills(tmp_path: Path, kills:
         assert seen(folder) == whole[pipe.config["default_num_inference_steps"]]
 
 
-@pytest.mark.parametrize("longest", [0, 300, 60_000])
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path, longest: int) -> None:
-    """Or as good as one: no file may be longer."""
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
+    """Or as good as one: no file may be longer than a setting, or than a part of the weights."""
     finished(Child(save_numbered, "there", 1, folder=tmp_path))
     before = seen(tmp_path / "there")
-    child = Child(save_numbered, "there", 2, folder=tmp_path, longest=longest)
-    assert child.wait() == 1 and "`save_directory` cannot be written to" in child.err.splitlines()[-1]
-    assert seen(tmp_path / "there") == before
+    for longest in (0, 60_000):
+        child = Child(save_numbered, "there", 2, folder=tmp_path, longest=longest)
+        assert child.wait() == 1 and "`save_directory` cannot be written to" in child.err.splitlines()[-1]
+        assert seen(tmp_path / "there") == before

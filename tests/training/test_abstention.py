@@ -15,7 +15,7 @@ from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temp
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import save_modalities
 
-SETTINGS = ("data.drawn={sensors: [digit], objects: 8, contacts_per_object: 1, held_out: 4}",)
+SETTINGS = ("data.drawn={sensors: [digit], objects: 4, contacts_per_object: 1, held_out: 2}",)
 
 
 @pytest.fixture
