@@ -169,24 +169,23 @@ SAVED = {
 }
 
 
-@pytest.mark.parametrize("name", SAVED)
-def test_state_dicts_of_all_formats_are_read(tmp_path, name):
-    SAVED[name](tmp_path / name)
-    tensors = open_checkpoint("touch", tmp_path / name)
-    assert set(tensors) == set(WEIGHTS) and all(torch.equal(tensors[key], WEIGHTS[key]) for key in WEIGHTS)
+def test_state_dicts_of_all_formats_are_read(tmp_path):
+    for name, write in SAVED.items():
+        write(tmp_path / name)
+        tensors = open_checkpoint("touch", tmp_path / name)
+        assert set(tensors) == set(WEIGHTS) and all(torch.equal(tensors[key], WEIGHTS[key]) for key in WEIGHTS), name
     assert "pytorch_lightning" not in sys.modules
 
 
-@pytest.mark.parametrize("kind", ["archive", "legacy", "bare"])
-def test_code_in_a_pickle_is_not_run(tmp_path, kind):
-    file, trap = tmp_path / "model.pth", tmp_path / "trap"
-    if kind == "bare":
-        file.write_bytes(pickle.dumps(Runs(trap), protocol=2))
-    else:
-        held = {"state_dict": WEIGHTS, "more": Runs(trap)}
-        torch.save(held, file, _use_new_zipfile_serialization=kind == "archive")
-    with pytest.raises(InvalidInputError, match=r"holds more than weights: .*mkdir, of which nothing was run"):
-        open_checkpoint("touch", file)
+def test_code_in_a_pickle_is_not_run(tmp_path):
+    trap, names = tmp_path / "trap", ("archive.pth", "legacy.pth", "bare.pth")
+    archive, legacy, bare = (tmp_path / name for name in names)
+    torch.save({"state_dict": WEIGHTS, "more": Runs(trap)}, archive)
+    torch.save({"state_dict": WEIGHTS, "more": Runs(trap)}, legacy, _use_new_zipfile_serialization=False)
+    bare.write_bytes(pickle.dumps(Runs(trap), protocol=2))
+    for file in (archive, legacy, bare):
+        with pytest.raises(InvalidInputError, match=r"holds more than weights: .*mkdir, of which nothing was run"):
+            open_checkpoint("touch", file)
     assert not trap.exists()
 
 
@@ -201,11 +200,12 @@ NO_FILE: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
-@pytest.mark.parametrize("content", NO_FILE)
-def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, content, suffix):
-    NO_FILE[content](tmp_path / f"model{suffix}")
-    with pytest.raises(InvalidInputError, match=r"`touch` names .*model.*(cannot be read|does not exist|no weights)"):
-        open_checkpoint("touch", tmp_path / f"model{suffix}")
+def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, suffix):
+    for name, write in NO_FILE.items():
+        file = tmp_path / f"{name}{suffix}"
+        write(file)
+        with pytest.raises(InvalidInputError, match=rf"`touch` names .*{name}.*(be read|does not exist|no weights)"):
+            open_checkpoint("touch", file)
 
 
 # The folder -----------------------------------------------------------------------------------------------------------

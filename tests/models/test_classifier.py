@@ -35,14 +35,13 @@ def test_shipped_classifiers_name_as_transformers_does(folder: Path) -> None:
     assert seen.features.shape == (3, ours.config.hidden_sizes[-1])
 
 
-@pytest.mark.parametrize("size", [64, 100, 128])
-def test_attributes_come_in_their_units_and_survive_a_folder(size: int, tmp_path: Path) -> None:
+def test_attributes_come_in_their_units_and_survive_a_folder(tmp_path: Path) -> None:
     scale = {"attributes": ["depth", "cover"], "attribute_means": [5.0, -3.0], "attribute_deviations": [0.0, 2.0]}
     config = ResNetConfig(embedding_size=8, hidden_sizes=[8, 16], depths=[1, 1], layer_type="basic", **scale)
     made = ContactClassifier(config).eval()
     made.save_pretrained(tmp_path)
     read = ContactClassifier.from_pretrained(tmp_path).eval()
-    images = torch.randn(2, 3, size, size)
+    images = torch.randn(2, 3, 100, 100)
     with torch.no_grad():
         one, other = made(images), read(images)
     assert one.attributes.shape == (2, 2) and torch.equal(one.attributes, other.attributes)

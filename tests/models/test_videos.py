@@ -61,9 +61,8 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     assert (processor.touch([file, recordings.frames()]) == expected).all()
 
 
-@pytest.mark.parametrize(
-    ("images", "error", "words"),
-    [
+def test_what_holds_no_contact_is_refused():
+    for images, error, words in (
         ([], InvalidInputError, "shows no contact"),
         ([np.roll(recordings.rest(), 20 * row, 1) for row in range(12)], InvalidInputError, "are alike"),
         ([recordings.rest()] * 20, InvalidInputError, "press while it records"),
@@ -72,11 +71,9 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
         (3, InvalidTypeError, "an iterable of frames"),
         (recordings.rest(), InvalidTypeError, "an iterable of frames"),
         ("gone.mp4", InvalidInputError, "does not exist"),
-    ],
-)
-def test_what_holds_no_contact_is_refused(images, error, words):
-    with pytest.raises(error, match=words):
-        firmest_contact(images)
+    ):
+        with pytest.raises(error, match=words):
+            firmest_contact(images)
 
 
 def test_damaged_videos_are_refused_or_their_contact_is_found(tmp_path):

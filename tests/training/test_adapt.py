@@ -89,14 +89,12 @@ def test_what_is_held_out_is_of_no_group_that_was_learned_from() -> None:
     assert not {groups[row] for row in kept} & {groups[row] for row in held}
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
+def test_what_does_not_fit_is_refused(model: UniTouchModel) -> None:
+    cases: list[tuple[str, dict, str]] = [
         ("digit", {}, "`sensor` is 'digit', which this model knows already"),
         ("mine", {"touches": TOUCHES[:7]}, "Got 7 touches of 7 objects"),
         ("mine", {"groups": ["one"] * COUNT}, "Got 24 touches of 1 objects; .* held out"),
-    ],
-)
-def test_what_does_not_fit_is_refused(model: UniTouchModel, name: str, arguments: dict, message: str) -> None:
-    with pytest.raises(InvalidInputError, match=message):
-        adapt(model, name, **{"touches": TOUCHES, **arguments})
+    ]
+    for name, arguments, message in cases:
+        with pytest.raises(InvalidInputError, match=message):
+            adapt(model, name, **{"touches": TOUCHES, **arguments})
