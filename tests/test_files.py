@@ -1,7 +1,6 @@
 """Files and folders are whole or not there, and what cannot be read or written is one error that names the argument."""
 
 import json
-import os
 import subprocess
 import sys
 import textwrap

@@ -1,6 +1,7 @@
 """Every case of the stability table keeps its bound; the bounds against closed forms."""
 
 import math
+import re
 import warnings
 from dataclasses import replace
 
