@@ -11,8 +11,9 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import diffusers
 import torch
@@ -50,11 +51,33 @@ from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport,
 
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
+Method = TypeVar("Method", bound=Callable[..., Any])
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
 MAX_IMAGES = 100_000  # maximum per input
 MAX_SIDE = 16_384  # pixels
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
+
+
+SMALL_NETWORK = 20_000_000
+"""Parameters below which threads of a CPU wait for each other longer than they work."""
+
+
+def runs_networks(method: Method) -> Method:
+    """A method of a pipeline that runs its networks: without gradients, and in one thread if its UNet is small."""
+
+    @wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        threads = torch.get_num_threads()
+        small = sum(parameter.numel() for parameter in self.unet.parameters()) < SMALL_NETWORK
+        torch.set_num_threads(1 if small else threads)
+        try:
+            with torch.no_grad():
+                return method(self, *args, **kwargs)
+        finally:
+            torch.set_num_threads(threads)
+
+    return run  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from unitouch_gen.pipelines.base import (
     StepEndCallback,
     Touches,
     check_weights,
+    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
@@ -87,7 +88,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
     _example_call = 'pipe(example("wood", "image"), example("gravel"))'
 
-    @torch.no_grad()
+    @runs_networks
     def __call__(  # type: ignore[override]
         self,
         image: ImageInput = None, touch: ImageInput = None, prompt: str | list[str] | None = None,

@@ -43,6 +43,7 @@ from unitouch_gen.pipelines.base import (
     Touches,
     UniTouchPipeline,
     check_unused,
+    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip
@@ -121,7 +122,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     # One call ---------------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @runs_networks
     def __call__(
         self,
         touch: ImageInput = None, prompt: str | list[str] | None = None,
@@ -268,7 +269,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         self.maybe_free_model_hooks()
         return images
 
-    @torch.no_grad()
+    @runs_networks
     def encode_touch(
         self,
         touch: ImageInput,

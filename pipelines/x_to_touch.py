@@ -36,6 +36,7 @@ from unitouch_gen.pipelines.base import (
     UniTouchPipeline,
     check_unused,
     check_weights,
+    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import read_joint, read_ldm
@@ -153,7 +154,7 @@ class XToTouchPipeline(UniTouchPipeline):
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @runs_networks
     def encode_condition(
         self,
         image: ImageInput = None,
@@ -185,7 +186,7 @@ class XToTouchPipeline(UniTouchPipeline):
 
     # One call ---------------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @runs_networks
     def __call__(
         self,
         image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,

@@ -4,7 +4,7 @@
         also stores them in unitouch_gen/weights/family.json and between the marks on the pages
     python -m tests.benchmarks --write --only
         measures nothing, and writes what is stored to the pages
-    python -m tests.benchmarks --only quality --recordings FOLDER
+    python -m tests.benchmarks --only quality --recordings FOLDER --photos FOLDER
         what the family is worth on the world and on real touches
     python -m tests.benchmarks --only adapt --recordings FOLDER
         a sensor adapted to recordings of real ones, see `adaptation`
@@ -39,7 +39,7 @@ def speed_figures() -> Figures:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
-    "quality": lambda given: quality_figures(given.recordings, given.seeds),
+    "quality": lambda given: quality_figures(given.recordings, given.photos, given.seeds),
     "world": lambda given: world_figures(),
     "speed": lambda given: speed_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
     parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
     parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `adaptation`")
+    parser.add_argument("--photos", type=Path, help="folder of whole photos, which are restyled")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
     family, console = json.loads(weights.FIGURES.read_text()), Console(width=110)

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model -o quality.json
         the joint space alone: sensors that nobody has seen, objects held out
-    python -m tests.benchmarks.quality --family runs/family
-        and what its pipelines make, judged by its classifiers
+    python -m tests.benchmarks.quality --family runs/family --touched-by gelsight --photos FOLDER
+        and what its pipelines make of a GelSight's touches, judged by its classifiers; photos are restyled, too
     python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER
         and real touches: `gelsight_objects.zip` of `adaptation`, and if it is there `objectfolder_dataPack.npz`, the
         ball presses of ObjectFolder 2.0 (github.com/rhgao/ObjectFolder, calibs/)
@@ -14,7 +14,7 @@ Every seed is a world of its own, with objects, sensors and noise of its own. Fi
 import argparse
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,10 +45,12 @@ from unitouch_gen.evaluation.generated import beside_class_means, generate, some
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
 from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
+from unitouch_gen.pipelines.tiny import PIPELINES
 from unitouch_gen.training.data.heldout import FIRST_SEED
-from unitouch_gen.world import ATTRIBUTES, SENSORS
+from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
+from unitouch_gen.world.attributes import gaussian_blur
 
 AMONG = 50
 """Contacts of its material that each one is found among, at most."""
@@ -153,12 +155,14 @@ def touch_to_image_rows(
 
 
 def x_to_touch_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, each: int, **options: Any) -> Figures:
-    """Touches by a named sensor, of pictures, captions and sounds."""
+    """Touches by a named sensor, of pictures, captions, sounds and bare words: the materials' names."""
     rows, figures = some(contacts, each), {}
     options["sensor"] = contacts.sensors[0]
-    inputs = {"image": contacts.image, "text": contacts.text, "audio": contacts.sounds()}
-    for modality, name in {"image": "photo", "text": "caption", "audio": "sound"}.items():
-        embeds = beside_class_means(pipe.encode_condition, modality, inputs[modality], contacts, rows)
+    words = [MATERIAL_NAMES[number].replace("_", " ") for number in contacts.material.tolist()]
+    inputs = {"photo": contacts.image, "caption": contacts.text, "sound": contacts.sounds(), "word": words}
+    for name, values in inputs.items():
+        modality = {"photo": "image", "sound": "audio"}.get(name, "text")
+        embeds = beside_class_means(pipe.encode_condition, modality, values, contacts, rows)
         made = {key: generate(pipe, seed, {"condition_embeds": one}, **options) for key, one in embeds.items()}
         found = image_rows(classifier, contacts, "touch", rows, made, float_pixels(contacts.second)[rows])
         figures |= {f"{name} to touch: {key}": row for key, row in found.items()}
@@ -169,7 +173,8 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     """Photos restyled by touches of other materials, by default and as in the paper, and as they were.
 
     "layout kept" is the correlation of the brightness with the photo's on 8 x 8 fields, "relief of the touch" the mean
-    correlation of what is read off the picture with the touch's, and its ceiling that of the touch's own picture.
+    correlation of what is read off the picture with the touch's, and its ceiling that of the touch's own picture;
+    "material of the touch" and "of the photo" are the shares that are named so.
     """
     rows = some(contacts, each)
     touched, names = rows.roll(each), [name for name in RELIEF if name in classifier.attributes]
@@ -179,8 +184,12 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     def measure(images: Tensor) -> dict[str, float]:
         coarse = (F.adaptive_avg_pool2d(values.mean(dim=1), 8).flatten(1) for values in (images, photos))
         kept = F.cosine_similarity(*(values - values.mean(dim=1, keepdim=True) for values in coarse)).mean().item()
-        read = classifier.observe(images).attributes[:, [classifier.attributes.index(name) for name in names]]
-        return {"layout kept": kept, "relief of the touch": mean(attribute_agreement(read, truth, names).values())}
+        said: Any = classifier.observe(images)
+        read = said.attributes[:, [classifier.attributes.index(name) for name in names]]
+        named = {"touch": contacts.material[touched], "photo": contacts.material[rows]}
+        shares = {f"material of the {of}": share_right(said.logits.argmax(dim=1), what) for of, what in named.items()}
+        relief = mean(attribute_agreement(read, truth, names).values())
+        return {"layout kept": kept, "relief of the touch": relief, **shares}
 
     restyle = partial(generate, pipe, seed, {"image": photos, "touch": touches}, **options)
     shown = {
@@ -192,6 +201,29 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
         del found["layout kept"]["ceiling"]
         figures |= {f"{name}: {key}": row for key, row in found.items()}
     return figures
+
+
+def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, seed: int) -> Figures:
+    """Whole photos restyled by touches, by default: "layout" is the correlation of brightness with the photo's, and
+    "colours" that of all three channels, blurred by 6 of 128 pixels; "detail" the median energy of what is finer than
+    that, over that of the touch's own picture."""
+    files = sorted(file for file in photos.iterdir() if file.suffix in (".jpg", ".png"))
+    touches = float_pixels(contacts.touch)[some(contacts, 1)[: len(files)]]
+    shown = torch.stack([centre_rectangle(image, 128, 128) for image in load_images("photos", files)])[: len(touches)]
+    made = generate(pipes["stylization"], seed, {"image": shown, "touch": touches})
+    own = generate(pipes["touch-to-image"], seed, {"touch": touches})
+    images = {"photo": shown, "made": made, "own": own}
+    blurred = {name: gaussian_blur(x.flatten(0, 1), 6.0).unflatten(0, (-1, 3)) for name, x in images.items()}
+
+    def alike(channels: Callable[[Tensor], Tensor]) -> float:
+        one, other = (channels(blurred[name]).flatten(1) for name in ("photo", "made"))
+        return (
+            F.cosine_similarity(*(values - values.mean(dim=1, keepdim=True) for values in (one, other))).mean().item()
+        )
+
+    energy = [(images[name] - blurred[name]).square().mean(dim=(1, 2, 3)) for name in ("made", "own")]
+    found = {"layout": alike(lambda images: images.mean(dim=1)), "colours": alike(lambda images: images)}
+    return {"photos": len(shown), **found, "detail": (energy[0] / energy[1]).median().item()}
 
 
 # Real touches ---------------------------------------------------------------------------------------------------------
@@ -257,34 +289,41 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     judges = {
         name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in given.classifiers.items()
     }
-    kinds = () if given.family is None else ("touch-to-image", "stylization", "x-to-touch")
-    pipes = {name: quiet(name, family=given.family) for name in kinds}
-    sensor = next((name for name in pipes["x-to-touch"].config.sensors if name in SENSORS), None) if pipes else None
-    options = {} if given.steps is None else {"num_inference_steps": given.steps}
+    pipes = {name: quiet(name, family=given.family) for name in given.pipelines if given.family}
     seeds = [given.first_seed + number for number in range(given.seeds)]
-    figures: Figures = {"split": given.split, "seeds": seeds, "sensor": sensor}
+    figures: Figures = {"split": given.split, "seeds": seeds, "touched_by": given.touched_by or "drawn"}
     if given.recordings:
         figures["real"] = real_figures(joint, given.recordings)
     rows = []
     for seed in seeds:
         contacts = held_out(cache, joint.processor, seed, given.split, given.touched_by, given.objects)
         found, drawn = joint_rows(joint, contacts, judges.get("touch")), (seed, given.each)
-        if pipes:
-            found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn, **options)
-            found |= restyled_rows(pipes["stylization"], judges["image"], contacts, *drawn, **options)
-        if sensor is not None:
-            named = held_out(cache, joint.processor, seed, given.split, sensor, given.objects)
-            found |= x_to_touch_rows(pipes["x-to-touch"], judges["touch"], named, *drawn, **options)
+        if "touch-to-image" in pipes:
+            found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn)
+        if "stylization" in pipes:
+            found |= restyled_rows(pipes["stylization"], judges["image"], contacts, *drawn)
+        if "x-to-touch" in pipes and given.touched_by:
+            found |= x_to_touch_rows(pipes["x-to-touch"], judges["touch"], contacts, *drawn)
+        if given.photos and seed == seeds[0]:
+            figures["photos"] = photo_figures(pipes, contacts, given.photos, seed)
         rows.append(found)
     return {**figures, "rows": over_seeds(rows) if rows else {}}
 
 
-def quality_figures(recordings: Path | None, seeds: int) -> Figures:
-    """All that can be measured of the built-in family on the split that nothing was chosen by."""
-    words = ["--family", str(weights.FAMILY), "--seeds", str(seeds), "--each", "4", "--objects", "10"]
-    words += [] if recordings is None else ["--recordings", str(recordings)]
+def quality_figures(recordings: Path | None, photos: Path | None, seeds: int) -> Figures:
+    """All that can be measured of the built-in family on the split that nothing was chosen by: of a GelSight's touches
+    in range, and under "drawn" and "beyond" by sensors drawn anew, and beyond the ranges of training."""
+    words = ["--family", str(weights.FAMILY), "--seeds", str(seeds), "--each", "4", "--objects", "12"]
+    named = ["--touched-by", "gelsight"]
+    for option, folder in {"--recordings": recordings, "--photos": photos}.items():
+        named += [] if folder is None else [option, str(folder)]
+    fewer = ["--pipelines", "touch-to-image"]
     with TemporaryDirectory() as scratch:
-        return measure(arguments(words), Path(scratch))
+        figures = measure(arguments([*words, *named]), Path(scratch))
+        figures["drawn"] = measure(arguments([*words, *fewer]), Path(scratch))["rows"]
+        beyond = [*fewer, "x-to-touch", "--touched-by", "gelsight", "--split", "beyond"]
+        figures["beyond"] = measure(arguments([*words, *beyond]), Path(scratch))["rows"]
+    return figures
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
@@ -300,7 +339,8 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--objects", type=int, default=16, help="held-out objects of each material")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--each", type=int, default=8, help="contacts of each material that are generated from")
-    parser.add_argument("--steps", type=int, help="of the samplers; the family's own if left out")
+    parser.add_argument("--pipelines", nargs="+", default=[*PIPELINES], choices=PIPELINES, help="whose figures; all")
+    parser.add_argument("--photos", type=Path, help="folder of whole photos to restyle")
     parser.add_argument("--cache", type=Path, help="where contacts are rendered to, and found again")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     given = parser.parse_args(words)

@@ -29,25 +29,27 @@ def percent(share: float) -> str:
 
 # Quality --------------------------------------------------------------------------------------------------------------
 
-SHARES = ("calibration error", "material", "within material", "within 20")
-"""Ends of the names of figures that are shares; others are correlations, angles and distances."""
+SHARES = ("material", "of the touch", "of the photo", "within 20")
+"""Ends of the names of figures that are shares; others are correlations and distances."""
 
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
+
+
+TOLD = ("material", "within material", "within 20", "Frechet distance", "layout kept", "of the touch", "of the photo")
+"""Ends of the names of figures that the pages show; `family.json` has them all."""
 
 
 def _shown(name: str, value: float | None) -> str:
     if value is None:
         return "-"
-    if name.endswith(SHARES):
-        return percent(value)
-    return f"{value:.0f}°" if name.endswith("degrees") else f"{value:.2f}"
+    return percent(value) if name.endswith(SHARES) and "relief" not in name else f"{value:.2f}"
 
 
 def quality_table(figures: Figures, *beginnings: str) -> str:
     """Figures whose names begin so, each beside its controls."""
     rows = []
     for name, row in figures["quality"]["rows"].items():
-        if name.startswith(beginnings):
+        if name.startswith(beginnings) and name.endswith(TOLD):
             value = f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})"
             rows.append([name, value, *(_shown(name, row[key]) for key in CONTROLS)])
     return table(["figure", "measured (spread)", *CONTROLS.values()], rows)
@@ -55,49 +57,61 @@ def quality_table(figures: Figures, *beginnings: str) -> str:
 
 SUMMARY = {
     "touch: material": "material of a touch, zero-shot",
+    "image: material": "... of a picture",
+    "audio: material": "... of a sound",
     "touch to its touch by another sensor, within material": "the contact by another sensor, among 50 of its material",
-    "touch, read linearly: grain within 20": "direction of the grain within 20 degrees, read off a touch",
-    "touch to picture: grain within 20": "... off the picture that is made of the touch",
-    "touch to picture: extent": "extent of the contact, in the picture that is made of the touch: correlation",
-    "touch to picture: fine relief": "fine relief, likewise",
-    "touch to picture: contact within material": "touch to picture: the contact, among 50 of its material",
-    "photo to touch: contact within material": "photo to touch: the same",
-    "caption to touch: contact within material": "caption to touch: the same",
-    "sound to touch: contact within material": "sound to touch: the same",
+    "touch to picture: material": "**touch to picture**: material",
+    "touch to picture: grain within 20": "... direction of the grain within 20 degrees",
+    "touch to picture: contact within material": "... the contact, among 50 of its material",
+    "photo to touch: material": "**photo to touch**: material",
+    "photo to touch: grain within 20": "... direction of the grain within 20 degrees",
+    "caption to touch: material": "caption to touch: material",
+    "word to touch: material": "bare word to touch: material",
+    "sound to touch: material": "sound to touch: material",
+    "restyled photo: material of the touch": "**photo restyled by a touch**: named as the touch's material",
+    "restyled photo: relief of the touch": "... relief of the touch (correlation)",
+    "restyled photo: layout kept": "... layout of the photo (correlation)",
 }
 """What README.md shows, in its words."""
 
+ELSEWHERE = ("touch: material", "touch to picture: material", "photo to touch: material")
+"""What it shows of drawn sensors and beyond the ranges of training."""
+
 
 def summary_table(figures: Figures) -> str:
-    """A few figures beside their controls, and what is read off real touches."""
+    """Figures of a GelSight's touches beside their controls, and a line each on what is harder."""
+    quality = figures["quality"]
     rows = []
     for name, words in SUMMARY.items():
-        row = figures["quality"]["rows"][name]
+        row = quality["rows"][name]
         rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
-    head = ["objects held out; sensors too, but for touches that are made", "measured", *CONTROLS.values()]
-    real = figures["quality"]["real"]["recordings"]
-    probes = [
-        [REAL_ROWS[name].replace("[relief](#the-relief-behind-a-touch)", "relief"), _deviating(real[name])]
-        for name in REAL_ROWS
-    ]
-    note = (
-        f"Balanced accuracy, chance {percent(1 / 3)}; nothing was trained on these recordings; ± is the deviation over "
-        "draws of objects."
+    lines = []
+    for part, words in {"drawn": "By sensors drawn anew", "beyond": "Beyond the ranges of training"}.items():
+        found = [(name, quality[part][name]) for name in ELSEWHERE if name in quality[part]]
+        told = (
+            f"{SUMMARY[n].replace('*', '')} {_shown(n, r['value'])} (shuffled {_shown(n, r['shuffled'])})"
+            for n, r in found
+        )
+        lines.append(f"{words}: {'; '.join(told)}.")
+    real = quality["real"]["recordings"]
+    lines.append(
+        "On a real GelSight, hardness, roughness and bumps of objects it has not seen are read linearly off its "
+        f"embeddings in {_deviating(real['touch encoder'])}, off plain statistics of the image in "
+        f"{_deviating(real['statistics'])}, off an untouched gel in {_deviating(real['untouched gel'])}; "
+        f"chance {percent(1 / 3)}."
     )
-    of = "hardness, roughness and bumps of a real GelSight's recordings, by a linear probe off"
-    return f"{table(head, rows)}\n\n{table([of, 'right'], probes, note)}"
+    head = ["held-out objects, touched by a GelSight", "measured", *CONTROLS.values()]
+    return table(head, rows, "\n".join(f"- {line}" for line in lines))
 
 
 def main_table(figures: Figures) -> str:
     """What the joint space and pictures from touches are worth, and seconds."""
     note = (
         f"Means over {len(figures['quality']['seeds'])} worlds, and the largest less the least of each. Chance of a "
-        f"material is {percent(1 / len(MATERIAL_NAMES))}, and so is naming all alike. One "
-        f"picture takes {figures['speed']['seconds_per_picture']:.2f} s after loading; "
-        f"{figures['world']['samples_per_second']:.0f} full samples of the world, under two drawn sensors, are "
-        f"rendered a second by two processes ({figures['speed']['machine']})."
+        f"material is {percent(1 / len(MATERIAL_NAMES))}. One picture takes "
+        f"{figures['speed']['seconds_per_picture']:.2f} s after loading ({figures['speed']['machine']})."
     )
-    return f"{quality_table(figures, 'touch: ', 'image: ', 'audio: ', 'touch to ', 'touch, read')}\n\n{note}"
+    return f"{quality_table(figures, 'touch: ', 'image: ', 'audio: ', 'text: ', 'touch to ', 'touch, read')}\n\n{note}"
 
 
 REAL_ROWS = {
@@ -163,7 +177,7 @@ def cost_table(figures: Figures) -> str:
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,
     "figures": main_table,
-    "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "sound to"),
+    "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "word to", "sound to"),
     "style figures": lambda figures: quality_table(figures, "photo as it was", "restyled"),
     "real figures": real_table,
     "cost at error": cost_table,

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -200,3 +201,23 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
         network.register_forward_hook(lambda *args: args[-1] * huge)
     output = call(throw=False)
     assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1
+
+
+def test_a_small_network_takes_one_thread_and_gives_them_back(pipe, touch):
+    """More would wait for each other on a machine that does something else."""
+    seen, before = [], torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        for stop in (False, True):
+
+            def look(*_, stop=stop):
+                seen.append(torch.get_num_threads())
+                if stop:
+                    raise KeyboardInterrupt
+                return {}
+
+            with suppress(KeyboardInterrupt):
+                pipe(touch, callback_on_step_end=look)
+            assert set(seen) == {1} and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
