@@ -121,8 +121,8 @@ def _card(family: Path, name: str) -> Card:
         return Card(figures=figures)
     return Card(
         figures=figures,
-        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
-        "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
+        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
+        "recording of a real sensor.",
         license="apache-2.0",
         limits="It is small and knows a procedural world; of real touches it says little.",
         pictures={caption: weights.CARDS / f"{name}.jpg"},

@@ -5,9 +5,6 @@ those of other modalities are moved towards, `image-vae/` the autoencoder of pic
 unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only that pipeline has.
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
 model cards, and `family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
-
-`joint-next/` is the joint space of the next family, trained on touches that tell their material; only benchmarks read
-it.
 """
 
 from pathlib import Path
