@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
+from diffusers import StableUnCLIPImg2ImgPipeline
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPVisionModelWithProjection
 
@@ -15,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import NEVER_READ, local_folder, read_settings, reading
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import autoencoder_in, check_filled, read_scheduler
+from unitouch_gen.pipelines.base import check_filled
 
 SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options; `revision` belongs to one repository
 
@@ -61,19 +61,6 @@ def read_unclip(
             model.vision_model = encoder
             model.config.vision_config = encoder.config
     return source
-
-
-def read_ldm(ldm: str | os.PathLike, dtype: torch.dtype, variant: str | None, hub: dict[str, Any]) -> dict[str, Any]:
-    """UNet, VAE and scheduler of a latent diffusion model in diffusers' layout."""
-    folder = local_folder("ldm", ldm, **hub)
-    check_holds("ldm", folder, ["unet", "vae", "scheduler"], "a latent diffusion model in diffusers' layout")
-    files = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
-    with reading("ldm", folder):
-        classes: dict[str, Any] = {"unet": UNet2DConditionModel, "vae": autoencoder_in(folder / "vae")}
-        parts = {name: cls.from_pretrained(folder / name, **files) for name, cls in classes.items()}
-        for name, network in parts.items():
-            check_filled(folder / name, network.eval())
-        return {**parts, "scheduler": read_scheduler(folder / "scheduler")}
 
 
 def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:

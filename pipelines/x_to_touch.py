@@ -1,9 +1,7 @@
 """`XToTouchPipeline`: touch images from images, text, audio or another sensor (Section 4.6 of the paper)."""
 
-import os
-import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +15,6 @@ from unitouch_gen.errors import (
     check_choice,
     check_integer,
     check_kind,
-    check_number,
     check_tensor,
     check_texts,
     describe,
@@ -39,7 +36,6 @@ from unitouch_gen.pipelines.base import (
     runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import read_joint, read_ldm
 from unitouch_gen.sampling import RunReport
 
 ALL = "all"  # in place of a sensor's name: every known sensor
@@ -126,31 +122,6 @@ class XToTouchPipeline(UniTouchPipeline):
     def takes_background(self) -> bool:
         """Whether background latents are input channels of the UNet, which so draws unnamed sensors, too."""
         return self.unet.config.in_channels != self.unet.config.out_channels
-
-    @classmethod
-    def from_published(
-        cls,
-        ldm: str | os.PathLike,
-        unitouch: str | os.PathLike | UniTouchModel,
-        *,
-        sensors: Sequence[str] = (),
-        embedding_norm: float | None = None,
-        dtype: torch.dtype = torch.float32,
-        variant: str | None = None,
-        **hub: Any,
-    ) -> Self:
-        """Builds on a latent diffusion model of touch in diffusers' layout, and a converted joint space.
-
-        Args:
-            ldm: Folder with `unet`, `vae` and `scheduler` as diffusers saves them, or repository id of one.
-            sensors: Names of the network's class labels, if it has any.
-            embedding_norm: The joint space's own when left out.
-            unitouch, dtype, variant, hub: See `TouchToImagePipeline.from_published`, for errors, too.
-        """
-        model, processor = read_joint(unitouch, dtype, hub)
-        if embedding_norm is not None:
-            model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
-        return cls(**read_ldm(ldm, dtype, variant, hub), unitouch=model, processor=processor, sensors=list(sensors))
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

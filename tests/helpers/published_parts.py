@@ -6,7 +6,7 @@ import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from transformers import CLIPImageProcessor, CLIPVisionModelWithProjection
 
-from tests.helpers.components import D, make_components, make_x_to_touch
+from tests.helpers.components import D, make_components
 from tests.helpers.imagebind import ImageBind
 from unitouch_gen.convert import convert_published
 from unitouch_gen.models import UniTouchConfig
@@ -50,14 +50,6 @@ def write_unclip(folder: Path, image_encoder: CLIPVisionModelWithProjection) -> 
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
     ).save_pretrained(folder)
     return folder
-
-
-def write_ldm(folder: Path) -> dict:
-    """Two sensors' latent diffusion in diffusers' layout; its parts."""
-    parts = {**make_x_to_touch(), "scheduler": make_components()["scheduler"]}
-    for name in ("unet", "vae", "scheduler"):
-        parts[name].save_pretrained(folder / name)
-    return parts
 
 
 def made(pipe, *args, **kwargs) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Pipelines of published parts: an unCLIP folder of diffusers, or a latent diffusion of touch, on a joint space."""
+"""Pipelines of published parts: an unCLIP folder of diffusers on a joint space."""
 
 import math
 import shutil
@@ -10,25 +10,23 @@ from torch.testing import assert_close
 from transformers import CLIPVisionModelWithProjection
 
 from tests.helpers.calls import Call, quiet, seeded
-from tests.helpers.published_parts import converted, sizes, write_ldm, write_unclip
+from tests.helpers.published_parts import converted, sizes, write_unclip
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline
 
-SENSORS = ["gelsight", "digit"]
-to_image, to_touch = TouchToImagePipeline.from_published, XToTouchPipeline.from_published
+to_image = TouchToImagePipeline.from_published
 
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
-    """Folders: a joint space, one of touch alone, an unCLIP with its image encoder, one with another, and an LDM."""
+    """Folders: a joint space, one of touch alone, an unCLIP with its image encoder, and one with another."""
     folder, other = (tmp_path_factory.mktemp("parts") for _ in range(2))
     joint, alone = converted(folder), converted(other, imagebind=False)
     unclip = write_unclip(folder / "unclip", UniTouchModel.from_pretrained(joint, modalities=("image",)).vision_model)
     torch.manual_seed(3)
     other = write_unclip(other / "unclip", CLIPVisionModelWithProjection(sizes().vision_config))
-    write_ldm(folder / "ldm")
-    return {"joint": joint, "alone": alone, "ldm": folder / "ldm", "unclip": unclip, "other": other}
+    return {"joint": joint, "alone": alone, "unclip": unclip, "other": other}
 
 
 def latents(pipe, **inputs):
@@ -48,16 +46,6 @@ def test_the_picture_is_that_of_the_parts_put_together_by_hand(parts, touch, tmp
     assert pipe.processor.tokenizer is pipe.tokenizer
     half = to_image(parts["unclip"], parts["joint"], dtype=torch.bfloat16)
     assert {one.dtype for one in (half.unet, half.vae, half.text_encoder, half.unitouch)} == {torch.bfloat16}
-
-
-def test_touches_of_a_latent_diffusion_model(parts, photo):
-    pipe, by_hand = to_touch(parts["ldm"], parts["joint"], sensors=SENSORS), write_ldm(parts["ldm"])
-    del by_hand["embedding_bank"]
-    other = XToTouchPipeline(**by_hand, unitouch=pipe.unitouch, processor=pipe.processor, sensors=SENSORS)
-    assert_close(latents(pipe, image=photo), latents(other, image=photo), atol=1e-5, rtol=1e-5)
-    assert pipe.encode_condition(photo).norm(dim=-1).flatten().tolist() == pytest.approx([1.0] * 2, rel=1e-5)
-    with pytest.raises(InvalidInputError, match="`unet`"):
-        to_touch(parts["unclip"], parts["joint"])
 
 
 def test_the_norm_of_embeddings_is_the_normalisers_or_given(parts, touch):
