@@ -90,7 +90,7 @@ def draw_grid(
 def save(picture: Image.Image, output: Path) -> None:
     """Writes a picture and says where it is."""
     output.parent.mkdir(parents=True, exist_ok=True)
-    picture.save(output)
+    picture.save(output, quality=88)
     print(output)
 
 

@@ -1,7 +1,7 @@
 """Restyles photos by touches: one row for each photo, one column for each touch.
 
 python samples/stylization_grid.py
-python samples/stylization_grid.py --output samples/pictures/stylization.png    # the README's
+python samples/stylization_grid.py --output samples/pictures/stylization.jpg    # the README's
 python samples/stylization_grid.py --photos mine.jpg --touches a.png b.png --touch-weight 0.5 --layout 8
 """
 

@@ -1,7 +1,7 @@
 """Draws one row for each material: a touch, the true picture, and pictures generated from the touch.
 
 python samples/touch_to_image_grid.py
-python samples/touch_to_image_grid.py --output samples/pictures/touch_to_image.png    # the README's
+python samples/touch_to_image_grid.py --output samples/pictures/touch_to_image.jpg    # the README's
 """
 
 import argparse

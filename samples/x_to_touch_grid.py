@@ -1,7 +1,7 @@
 """Draws one row for each material: a photo, the true touch, and touches imagined from photo, caption and sound.
 
 python samples/x_to_touch_grid.py
-python samples/x_to_touch_grid.py --output samples/pictures/x_to_touch.png    # the README's
+python samples/x_to_touch_grid.py --output samples/pictures/x_to_touch.jpg    # the README's
 """
 
 import argparse
