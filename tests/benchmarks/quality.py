@@ -205,25 +205,26 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
 
 def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, seed: int) -> Figures:
     """Whole photos restyled by touches, by default: "layout" is the correlation of brightness with the photo's, and
-    "colours" that of all three channels, blurred by 6 of 128 pixels; "detail" the median energy of what is finer than
-    that, over that of the touch's own picture."""
+    "colours" that of all three channels, blurred by 6 of 128 pixels; "detail" the median energy of what has changed and
+    is finer than that, over the energy of what is finer in the touch's own picture."""
     files = sorted(file for file in photos.iterdir() if file.suffix in (".jpg", ".png"))
     touches = float_pixels(contacts.touch)[some(contacts, 1)[: len(files)]]
     shown = torch.stack([centre_rectangle(image, 128, 128) for image in load_images("photos", files)])[: len(touches)]
     made = generate(pipes["stylization"], seed, {"image": shown, "touch": touches})
     own = generate(pipes["touch-to-image"], seed, {"touch": touches})
-    images = {"photo": shown, "made": made, "own": own}
-    blurred = {name: gaussian_blur(x.flatten(0, 1), 6.0).unflatten(0, (-1, 3)) for name, x in images.items()}
+
+    def coarse(images: Tensor) -> Tensor:
+        return gaussian_blur(images.flatten(0, 1), 6.0).unflatten(0, images.shape[:2])
 
     def alike(channels: Callable[[Tensor], Tensor]) -> float:
-        one, other = (channels(blurred[name]).flatten(1) for name in ("photo", "made"))
+        one, other = (channels(coarse(images)).flatten(1) for images in (shown, made))
         return (
             F.cosine_similarity(*(values - values.mean(dim=1, keepdim=True) for values in (one, other))).mean().item()
         )
 
-    energy = [(images[name] - blurred[name]).square().mean(dim=(1, 2, 3)) for name in ("made", "own")]
+    changed, fine = ((images - coarse(images)).square().mean(dim=(1, 2, 3)) for images in (made - shown, own))
     found = {"layout": alike(lambda images: images.mean(dim=1)), "colours": alike(lambda images: images)}
-    return {"photos": len(shown), **found, "detail": (energy[0] / energy[1]).median().item()}
+    return {"photos": len(shown), **found, "detail": (changed / fine).median().item()}
 
 
 # Real touches ---------------------------------------------------------------------------------------------------------
