@@ -21,7 +21,7 @@ from unitouch_gen.training.stages import STAGES, command_of, run_command, weight
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
 TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 20,
                   "default_noise_level": 250}  # fmt: skip
-X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
+X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
 
 
 def halved(sources: list[Path], target: Path) -> None:
