@@ -18,7 +18,6 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 from typer import Option
 
-from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
@@ -27,7 +26,6 @@ from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of, material_names
 from unitouch_gen.training.recipe import read, read_recipe
 from unitouch_gen.training.stages import run_command
-from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
 Splits = Sequence[Rendered]
@@ -100,17 +98,14 @@ def fit_reaches(model: UniTouchModel, held: Splits, share: float) -> None:
 
 
 @torch.no_grad()
-def fit_temperatures(
-    model: UniTouchModel, processor: UniTouchProcessor, held: Splits, names: Sequence[str], bank: EmbeddingBank | None
-) -> None:
-    """Fits a temperature of each modality, and that of touches by pictures, which follow theirs, if there is a bank."""
+def fit_temperatures(model: UniTouchModel, processor: UniTouchProcessor, held: Splits, names: Sequence[str]) -> None:
+    """Fits a temperature of each modality."""
     labels, model.config.temperatures = torch.from_numpy(np.concatenate([split.material for split in held])), {}
-    for modality, pictures in [*((name, None) for name in MODALITIES), *([("touch", bank)] if bank else [])]:
-        classifier = ZeroShotTouchClassifier(model, processor, pictures)
+    classifier = ZeroShotTouchClassifier(model, processor)
+    for modality in MODALITIES:
         encode = getattr(model, f"get_{modality}_features")
         embeds = torch.cat([encode(part).float().cpu() for part in inputs_of(held, modality, processor)])
-        fitted = fit_temperature(classifier.scores(embeds, modality, names), labels)
-        model.config.temperatures[classifier.fitted_as(modality)] = fitted
+        model.config.temperatures[modality] = fit_temperature(classifier.scores(embeds, modality, names), labels)
 
 
 def abstention(
@@ -121,10 +116,7 @@ def abstention(
     share: Annotated[float, Option(min=0.001, max=0.5, help="Share of known touches on which it abstains.")] = 0.046,
     cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:
-    """Fits what a joint space does not know, and writes it into its folder: no weight changes.
-
-    A bank of image embeddings beside it, as in a family, is what touches are named by as well.
-    """
+    """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
     data = read(DataConfig, read_recipe(recipe, overrides or ()).get("data"), "data")
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
     needs, sources, most = (*MODALITIES, "material"), data.sources(), 500  # samples of each source and split
@@ -134,9 +126,7 @@ def abstention(
     fit_distance(model, processor, train, held, share)
     if data.drawn is not None:  # an encoder that has seen touches without a sensor's tokens
         fit_reaches(model, held, share / 2)
-    place = joint.parent / EMBEDDING_BANK.name
-    bank = EmbeddingBank.from_pretrained(place) if place.is_dir() else None
-    fit_temperatures(model, processor, held, material_names(sources), bank)
+    fit_temperatures(model, processor, held, material_names(sources))
     with safe_open(next(joint.glob("model*.safetensors")), framework="pt") as stored:
         dtype = stored.get_tensor(next(key for key in stored.keys() if key.endswith("weight"))).dtype  # noqa: SIM118
     model.to(dtype).save_pretrained(joint)  # type: ignore[arg-type]

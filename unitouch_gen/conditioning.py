@@ -150,10 +150,6 @@ class EmbeddingBank(StoredCondition):
         bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
         return bank
 
-    def similarities(self, embeds: Tensor) -> Tensor:
-        """softmax(cosine / temperature) of embeddings (B, D) over the stored ones, (B, N)."""
-        return (match_norm(embeds, 1.0) @ self.embeds.to(embeds).T / self.config["temperature"]).softmax(dim=-1)
-
     def bridge(self, embeds: Tensor) -> Tensor:
         """`bridge_nearest` of embeddings (B, D), with the bank's settings."""
         settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}

@@ -15,8 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, attribute_agreement
-from unitouch_gen import weights
-from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.evaluation.contacts import Contacts, image_embeddings
 from unitouch_gen.evaluation.controls import class_means, with_controls
 from unitouch_gen.evaluation.metrics import calibration_error, retrieval, share_right
@@ -41,14 +39,10 @@ def held_out(
 
 @dataclass
 class JointSpace:
-    """Encoders of one space, which may lie in several folders: each modality is of the first that has it.
-
-    The bank of pictures lies beside the first, if that is `joint` of a family: another space there has another bank.
-    """
+    """Encoders of one space, which may lie in several folders: each modality is of the first that has it."""
 
     models: dict[str, UniTouchModel]
     processor: UniTouchProcessor
-    embedding_bank: EmbeddingBank | None = None
 
     @classmethod
     def from_folders(cls, folders: Sequence[Path]) -> "JointSpace":
@@ -56,10 +50,7 @@ class JointSpace:
         for folder in folders:
             model = UniTouchModel.from_pretrained(folder).eval()
             models = {**dict.fromkeys(model.known_modalities, model), **models}
-        bank = folders[0].parent / weights.EMBEDDING_BANK.name  # as families hold it
-        own = folders[0].name == weights.JOINT.name and bank.is_dir()
-        embedding_bank = EmbeddingBank.from_pretrained(bank) if own else None
-        return cls(models, UniTouchProcessor.from_pretrained(folders[0]), embedding_bank)
+        return cls(models, UniTouchProcessor.from_pretrained(folders[0]))
 
     @torch.no_grad()
     def features(self, modality: str, values: Any) -> Tensor:
@@ -75,7 +66,7 @@ class JointSpace:
 
 def material_rows(joint: JointSpace, modality: str, features: Tensor, material: Tensor) -> Figures:
     """The share of embeddings whose "material" is named right, and the "calibration error" of its probabilities."""
-    classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor, joint.embedding_bank)
+    classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor)
 
     def measure(values: Tensor) -> dict[str, float]:
         shares = classifier.probabilities(values, modality)

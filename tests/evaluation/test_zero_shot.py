@@ -6,7 +6,6 @@ import torch
 from scipy.special import softmax
 
 from tests.helpers.components import make_components
-from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.evaluation.zero_shot import (
     PROMPTS,
@@ -73,23 +72,6 @@ def test_shares_are_a_softmax_at_the_fitted_temperature(template, temperature, c
     assert classifier.calibrated == fitted
 
 
-def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(classifier, images, embeds, monkeypatch):
-    model, processor = classifier.model, classifier.processor
-    monkeypatch.setattr(model.config, "temperatures", {"image": 0.2, "touch": 9.0})  # of touches by cosines alone
-    bank = EmbeddingBank.of(torch.randn(5, 16, generator=torch.Generator().manual_seed(3)), temperature=0.1)
-    banked, touches = ZeroShotTouchClassifier(model, processor, bank), embeds.double().numpy()
-    classes = text_embeddings(model, processor, [PROMPTS["touch"].format(name) for name in NAMES]).double().numpy()
-    pictures = bank.embeds.double().numpy()
-    near = softmax(touches @ pictures.T / np.linalg.norm(touches, axis=1, keepdims=True) / 0.1, axis=1)
-    shares = near @ softmax(pictures @ classes.T / 0.2, axis=1)
-    assert named_as(banked(images, NAMES), shares)
-    assert not banked.calibrated and classifier.calibrated
-    monkeypatch.setitem(model.config.temperatures, "touch by pictures", 2.0)
-    assert banked.calibrated and named_as(banked(images, NAMES), shares**0.5 / (shares**0.5).sum(1, keepdims=True))
-    heard = torch.randn(2, 16, generator=torch.Generator().manual_seed(4))  # what is no touch is named by itself
-    assert banked.name(heard, "audio", NAMES) == classifier.name(heard, "audio", NAMES)
-
-
 def test_what_is_known_is_said_in_words():
     shares, unlike = {"brick": 0.8, "tile": 0.12}, "unlike anything known"
     assert str(Named(shares, None)) == "brick 80%, tile 12%"
@@ -124,8 +106,6 @@ def test_the_processor_is_read_from_the_models_folder(classifier, images, tmp_pa
         ZeroShotTouchClassifier(model)
     with pytest.raises(InvalidInputError, match="no tokenizer"):
         ZeroShotTouchClassifier(model, UniTouchProcessor(image_size=32))
-    with pytest.raises(InvalidInputError, match="`embedding_bank` has embeddings of width 8, the model of 16"):
-        ZeroShotTouchClassifier(model, processor, EmbeddingBank.of(torch.eye(8)))
 
 
 def test_bad_input_is_refused_by_name(classifier, images):

@@ -8,7 +8,6 @@ import torch
 from safetensors.torch import load_file
 from scipy.spatial.distance import mahalanobis
 
-from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.evaluation.metrics import calibration_error
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temperature
@@ -29,8 +28,6 @@ def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_writte
     space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered
 ) -> None:
     before = load_file(space / "model.safetensors")
-    width = UniTouchModel.from_pretrained(space).config.projection_dim
-    EmbeddingBank.of(torch.randn(9, width)).save_pretrained(space.parent / "embedding-bank")
     abstention(joint=space, overrides=list(SETTINGS), cache=cache)
     after = load_file(space / "model.safetensors")
     assert {key for key in after if not key.startswith("out_of_distribution.")} == set(before)
@@ -38,7 +35,7 @@ def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_writte
     new = {key: tensor for key, tensor in after.items() if key not in before}
     assert new and all(tensor.dtype == torch.float16 for tensor in new.values())
     again = UniTouchModel.from_pretrained(space)
-    assert set(again.config.temperatures) == {*MODALITIES, "touch by pictures"}
+    assert set(again.config.temperatures) == {*MODALITIES}
     assert list(again.config.ood_thresholds) == ["touch"]
     assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):

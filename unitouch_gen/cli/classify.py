@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Option, echo
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import files_of, folder_of, load_joint_space
+from unitouch_gen.cli.loading import files_of, load_joint_space
 
 
 def classify(
@@ -23,15 +23,11 @@ def classify(
     Example: unitouch-gen classify example:brick example:wood --labels brick,wood,grass
     """
     touches = files_of("touch", touch, "touch")
-    from unitouch_gen.conditioning import EmbeddingBank  # takes seconds, a mistake should not
-    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
-    from unitouch_gen.weights import EMBEDDING_BANK
+    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier  # takes seconds, a mistake should not
     from unitouch_gen.world import MATERIAL_NAMES
 
     joint, processor = load_joint_space(model, device)
-    place = EMBEDDING_BANK if model is None else folder_of(model) / "embedding_bank"
-    bank = EmbeddingBank.from_pretrained(place).to(joint.device) if place.is_dir() else None
-    classifier = ZeroShotTouchClassifier(joint, processor, bank)
+    classifier = ZeroShotTouchClassifier(joint, processor)
     names = MATERIAL_NAMES if labels is None else [name.strip() for name in labels.split(",")]
     found = {file: classifier(file, names, template, sensor=sensor, top=top)[0] for file in touches}
     if as_json:

@@ -142,6 +142,6 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
         raise gradio.Error(said, duration=None, print_exception=False) from error
     felt = ""
     if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
-        classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor, pipe.embedding_bank)
+        classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier.name(output.encoded[:1], "touch")[0])
     return output.images, felt, str(output.report), str(seed)

@@ -6,7 +6,6 @@ pictures near it are.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -19,13 +18,8 @@ from unitouch_gen.models.out_of_distribution import UNTOUCHED
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.world import MATERIAL_NAMES
 
-if TYPE_CHECKING:
-    from unitouch_gen.conditioning import EmbeddingBank
-
 PROMPTS = {**dict.fromkeys(("image", "audio", "text"), "this looks like {}"), "touch": "this feels like {}"}
 """The template of each modality; that of touch is the paper's (Table 7)."""
-
-BY_PICTURES = "touch by pictures"  # the temperature of touches that are named by a bank of pictures
 
 
 @torch.no_grad()
@@ -58,39 +52,27 @@ class ZeroShotTouchClassifier:
     Args:
         model: With touch and text.
         processor: Of both; that of the model's folder if left out.
-        embedding_bank: Of pictures. With it, p(label | touch) = sum_k p(picture k | touch) p(label | picture k), the
-            first by `EmbeddingBank.similarities`; without, a softmax over the touch's own cosines with the labels.
 
     Raises:
-        InvalidInputError: If there is no processor with a tokenizer, or the bank is of another width than the model.
+        InvalidInputError: If there is no processor with a tokenizer.
 
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
         >>> from unitouch_gen import example
-        >>> from unitouch_gen.conditioning import EmbeddingBank
-        >>> from unitouch_gen.weights import EMBEDDING_BANK
-        >>> classifier = ZeroShotTouchClassifier(*joint_space(), EmbeddingBank.from_pretrained(EMBEDDING_BANK))
+        >>> classifier = ZeroShotTouchClassifier(*joint_space())
         >>> [named] = classifier(example("brick"), ["brick", "grass"], template="this feels like {}")
         >>> sorted(named)
         ['brick', 'grass']
     """
 
-    def __init__(
-        self,
-        model: UniTouchModel,
-        processor: UniTouchProcessor | None = None,
-        embedding_bank: "EmbeddingBank | None" = None,
-    ):
+    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor | None = None):
         if processor is None:
             if model.source is None:
                 raise InvalidInputError("`processor` is None, and the model has no folder to read one from; pass one.")
             processor = UniTouchProcessor.from_pretrained(model.source)
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
-        width = model.config.projection_dim
-        if embedding_bank is not None and (found := embedding_bank.config["embedding_dim"]) != width:
-            raise InvalidInputError(f"`embedding_bank` has embeddings of width {found}, the model of {width}.")
-        self.model, self.processor, self.embedding_bank = model, processor, embedding_bank
+        self.model, self.processor = model, processor
 
     @torch.no_grad()
     def __call__(
@@ -140,7 +122,7 @@ class ZeroShotTouchClassifier:
 
         Args:
             features: (B, D), of any length.
-            modality: That they came from; its template and temperature are used, and for touches the bank.
+            modality: That they came from; its template and temperature are used.
             labels, template, top: See `__call__`.
             unknown: What `UniTouchModel.unknown_touches` says of each; nothing where it is empty.
         """
@@ -152,30 +134,18 @@ class ZeroShotTouchClassifier:
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
     ) -> Tensor:
         """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
-        return self._calibrated(self.fitted_as(modality), self.scores(features, modality, labels, template))
+        config = self.model.config
+        temperature = config.temperatures.get(modality, config.temperature)
+        return (self.scores(features, modality, labels, template) / temperature).softmax(dim=1)
 
     def scores(
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
     ) -> Tensor:
-        """What probabilities are a softmax of, (B, labels): cosines, or the bank's logarithms of p(label | touch)."""
+        """Cosines of embeddings with the labels in words, (B, labels)."""
         texts = [(template or PROMPTS[modality]).format(label) for label in labels]
-        classes, bank = text_embeddings(self.model, self.processor, texts), self.embedding_bank
-        if modality != "touch" or bank is None:
-            return F.normalize(features.float(), dim=-1) @ classes.T
-        of_pictures = self._calibrated("image", F.normalize(bank.embeds.to(classes), dim=-1) @ classes.T)  # (N, labels)
-        shares = bank.similarities(features.to(classes)) @ of_pictures
-        return shares.clamp_min(torch.finfo(shares.dtype).tiny).log()
-
-    def _calibrated(self, fitted_as: str, scores: Tensor) -> Tensor:
-        config = self.model.config
-        temperature = config.temperatures.get(fitted_as, 1.0 if fitted_as == BY_PICTURES else config.temperature)
-        return (scores / temperature).softmax(dim=1)
-
-    def fitted_as(self, modality: str) -> str:
-        """The name of a modality's temperature in `UniTouchConfig.temperatures`."""
-        return BY_PICTURES if modality == "touch" and self.embedding_bank is not None else modality
+        return F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
 
     @property
     def calibrated(self) -> bool:
         """Whether the probabilities of touches are calibrated: for labels like those that this was fitted to."""
-        return self.fitted_as("touch") in self.model.config.temperatures
+        return "touch" in self.model.config.temperatures

@@ -126,7 +126,7 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
-        temperatures: Of zero-shot classification, fitted to validation samples, by modality or "touch by pictures".
+        temperatures: Of zero-shot classification, fitted to validation samples, by modality.
         ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
             of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
