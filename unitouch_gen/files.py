@@ -1,14 +1,16 @@
 """Files and folders: put in place whole by a rename, and read with errors that name the argument."""
 
+import csv
 import ctypes
 import functools
+import io
 import json
 import os
 import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -172,6 +174,45 @@ def natural(path: str | Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
+def is_hidden(path: Path) -> bool:
+    """Whether a path in a folder of the user's is what systems and programs leave there for themselves."""
+    return any(part.startswith((".", "~$")) or part in ("@eaDir", "__MACOSX", "$RECYCLE.BIN") for part in path.parts)
+
+
+def read_text(file: Path) -> str:
+    """A text in UTF-8, or in UTF-16 as spreadsheets write it; nothing where there is no file."""
+    content = file.read_bytes() if file.is_file() else b""
+    try:
+        return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{str(file)!r} is not in UTF-8; save it as UTF-8.") from error
+
+
+def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
+    """The rows of a table by the names in its first line, or others, without blank rows and columns at its end.
+
+    Columns are parted by commas, semicolons or tabs.
+    """
+    text = read_text(file)
+    if said := re.match(r'"?sep=(.)"?\r?\n', text):  # to Excel
+        text = text[said.end() :]
+    delimiter = said[1] if said else max(",;\t", key=text.lstrip().partition("\n")[0].count)
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    try:
+        cells = [[cell.strip() for cell in row] for row in lines if any(map(str.strip, row))]
+    except csv.Error as error:
+        raise InvalidInputError(f"{str(file)!r} is no table: {error}, in line {lines.line_num}.") from error
+    names = header or [name.lower() for name in (cells.pop(0) if cells else ())]
+    width = max((place for row in (names, *cells) for place, cell in enumerate(row, start=1) if cell), default=0)
+    names, cells = names[:width], [row[:width] for row in cells]
+    odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
+    if not cells or odd or len(set(names)) < len(names):
+        rows = ", ".join(odd[:5]) + (f" and {len(odd) - 5} more" if len(odd) > 5 else "")
+        wrong = f"other columns in row {rows}; quote texts that hold commas" if odd else "two of one name"
+        raise InvalidInputError(f"{str(file)!r} has the columns {[*names]}, and {wrong if cells else 'no rows'}.")
+    return [dict(zip(names, row, strict=True)) for row in cells]
+
+
 def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.loads) -> dict[str, Any]:
     """The settings in a file in UTF-8: JSON, or what another parser reads."""
     check_file(name, file, "a settings file")
@@ -188,8 +229,10 @@ def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.load
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
+    import torch
+
     folder = as_path(name, place)
-    with _LOADING:
+    with _LOADING, torch.inference_mode(False):  # inference tensors can never be trained
         try:
             for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
                 read_settings(name, file)  # libraries name no file, and would wait for a pipe

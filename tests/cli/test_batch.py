@@ -71,7 +71,7 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         ("touch,num_inference_step\nin/dark.png,1\n", [], "Did you mean 'num_inference_steps'?"),
         ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
         ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
-        ("touch\nin/dark.png,1\n", [], "'a cell without a column'"),
+        ("touch\nin/dark.png,1\n", [], "other columns in row 1"),
         ('touch\n"in/dark.png\n', [], "no .csv or .jsonl"),
         ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
         ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`column` is 'bogus'"),

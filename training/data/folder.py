@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in, read_table
+from unitouch_gen.files import read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in
 
 LOOKS_LIKE = ()
 FRAMES = ("touch", "picture", "background")
@@ -25,7 +26,7 @@ SPLITS = ("train", "val", "test")
 
 def read(folder: Path, patterns: Mapping[str, str] | None = None) -> Iterator[Record | str]:
     """What its table names, or the images in it."""
-    tables = found(folder, "*.csv")
+    tables = [file for file in found(folder, "*") if file.suffix.lower() in (".csv", ".tsv")]
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     yield from read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import torch.nn.functional as F
 
-from unitouch_gen.training.data.records import Frame, Record, column_of, found, frame_at, read_table
+from unitouch_gen.files import read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, found, frame_at
 
 LOOKS_LIKE = ("data*/train.csv", "data*/test.csv")
 COLUMNS = (("url", "vision", "image", "rgb"), ("tactile", "touch"), ("tactile_background", "background"),

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.records import Frame, Record, few, found, frame_at, read_text
+from unitouch_gen.files import read_text
+from unitouch_gen.training.data.records import Frame, Record, few, found, frame_at
 
 LOOKS_LIKE, CLASSES = ("label.json",), {"material": tuple("0123456")}
 

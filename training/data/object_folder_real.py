@@ -6,7 +6,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from unitouch_gen.training.data.records import Frame, Record, column_of, found, read_table
+from unitouch_gen.files import read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, found
 
 LOOKS_LIKE = ("*/tactile_data/*/0/gelsight/*.png",)
 

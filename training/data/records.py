@@ -1,7 +1,5 @@
 """Records, each a touch with all that is known of it; and what layouts of data sets find and read them with."""
 
-import csv
-import io
 import threading
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,8 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, first_line, needed
-from unitouch_gen.files import natural
+from unitouch_gen.files import is_hidden, natural
 from unitouch_gen.models.images import load_images
+from unitouch_gen.models.videos import shown
 
 IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}
 """Suffixes of files that Pillow reads as images."""
@@ -75,9 +74,9 @@ def few(names: Sequence[str]) -> str:
 
 
 def found(folder: Path, *patterns: str) -> list[Path]:
-    """What patterns find in a folder, in natural order, without hidden files."""
-    paths = {path for pattern in patterns for path in folder.glob(pattern) if not path.name.startswith(".")}
-    return sorted(paths, key=natural)
+    """What patterns find in a folder, in natural order, without hidden files and those in hidden folders."""
+    paths = {path for pattern in patterns for path in folder.glob(pattern)}
+    return sorted((path for path in paths if not is_hidden(path.relative_to(folder))), key=natural)
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
@@ -88,27 +87,6 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
 def frame_at(file: Path) -> Frame | None:
     """An image file, if it is there."""
     return Frame(str(file)) if file.is_file() else None
-
-
-def read_text(file: Path) -> str:
-    """A text in UTF-8; nothing where there is no file."""
-    try:
-        return file.read_text(encoding="utf-8-sig") if file.is_file() else ""
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{str(file)!r} is not in UTF-8; save it as UTF-8.") from error
-
-
-def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
-    """The rows of a table with columns parted by commas, semicolons or tabs, by the names in its first line."""
-    text = read_text(file)
-    delimiter = max(",;\t", key=text.partition("\n")[0].count)
-    cells = [row for row in csv.reader(io.StringIO(text), delimiter=delimiter) if any(map(str.strip, row))]
-    names = header or [name.strip().lower() for name in (cells.pop(0) if cells else ())]
-    odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
-    if not cells or odd or len(set(names)) < len(names):
-        wrong = f"other columns in row {few(odd)}; quote texts that hold commas" if odd else "two of one name"
-        raise InvalidInputError(f"{str(file)!r} has the columns {names}, and {wrong if cells else 'no rows'}.")
-    return [dict(zip(names, map(str.strip, row), strict=True)) for row in cells]
 
 
 def column_of(file: Path, columns: Iterable[str], known: Sequence[str]) -> str:
@@ -153,6 +131,6 @@ class Video:
         for frame in self.frames:
             if frame.pts is not None and frame.pts >= wanted:
                 self.time = frame.pts
-                return frame.to_ndarray(format="rgb24")
+                return shown(frame, self.stream)
         self.time = self.times[-1]
         raise ValueError("the video ends before that frame")

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.records import Frame, Record, found, frame_at, images_in, read_table, read_text
+from unitouch_gen.files import read_table, read_text
+from unitouch_gen.training.data.records import Frame, Record, found, frame_at, images_in
 
 LOOKS_LIKE = ("images_tac",)
 

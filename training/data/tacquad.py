@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.records import Frame, Record, found, images_in, read_table
+from unitouch_gen.files import read_table
+from unitouch_gen.training.data.records import Frame, Record, found, images_in
 
 LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.records import Frame, Record, few, read_text
+from unitouch_gen.files import read_text
+from unitouch_gen.training.data.records import Frame, Record, few
 
 LOOKS_LIKE = ("dataset/[0-9]*_[0-9]*",)
 MATERIALS = (

@@ -3,7 +3,6 @@
 A picture that is there is not made again: the same command goes on where one was killed, and tries anew what failed.
 """
 
-import csv
 import inspect
 import json
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, load_pipeline, suffixes_of
+from unitouch_gen.cli.loading import CLASSES, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, first_line
 
@@ -43,7 +42,7 @@ def batch(
     Example: unitouch-gen batch touches/ -o pictures/
     """
     check_choice("--pipeline", pipeline, CLASSES)
-    rows = in_folder(source, pipeline) if source.is_dir() else in_list(source)
+    rows = in_folder(source, pipeline, output) if source.is_dir() else in_list(source)
     import torch
     from accelerate import PartialState
     from accelerate.utils import gather_object
@@ -89,28 +88,29 @@ def batch(
 # The list -------------------------------------------------------------------------------------------------------------
 
 
-def in_folder(folder: Path, pipeline: str) -> list[dict[str, str]]:
-    """The columns of every file of a folder and those below, which names its picture by its place."""
+def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
+    """The columns of every file of a folder and those below, but for the output, which names its picture by its place."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
-    files = [file for file in sorted(folder.rglob("*")) if file.suffix.lower() in columns and file.is_file()]
+    paths = [file for file in sorted(folder.rglob("*")) if output.resolve() not in file.resolve().parents]
+    files = files_in(folder, paths, columns)
     places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
     return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
 
 
 def in_list(file: Path) -> list[dict[str, Any]]:
-    """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
-    from unitouch_gen.files import check_file
+    """The columns of every line of a table with a header, or of a .jsonl; blank cells are left out."""
+    from unitouch_gen.files import check_file, read_table, read_text
 
     check_file("source", file, "a .csv or .jsonl file")
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines(keepends=True)
-        if file.suffix == ".csv":
-            rows: list[Any] = list(csv.DictReader(lines, restkey="a cell without a column", strict=True))
+        rows: list[Any]
+        if file.suffix.lower() in (".csv", ".tsv"):
+            rows = read_table(file)
         else:
-            rows = [dict(json.loads(line)) for line in lines if line.strip()]
-    except (csv.Error, OSError, ValueError, TypeError, RecursionError) as error:
-        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
+            rows = [dict(json.loads(line)) for line in read_text(file).split("\n") if line.strip()]
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}"
         raise InvalidInputError(message) from error
     return [{column: value for column, value in row.items() if value not in (None, "")} for row in rows]
 

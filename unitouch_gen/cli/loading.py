@@ -4,16 +4,17 @@ import glob
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unitouch_gen.cli.options import note
 from unitouch_gen.errors import InvalidInputError, check_dtype
 
 if TYPE_CHECKING:
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
-IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".webp"})
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
 CLASSES = {
@@ -39,8 +40,8 @@ def suffixes_of(modality: str) -> frozenset[str]:
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
     """The files of a modality that words of a command line stand for, in their order.
 
-    A word is the path of a file, of a folder, a pattern such as "touches/**/*.png", or "example:brick". `name` is the
-    argument, for the messages.
+    A word is the path of a file, of a folder, a pattern such as "touches/**/*.png", or "example:brick". Of folders and
+    patterns, what is hidden or has another suffix is left out. `name` is the argument, for the messages.
     """
     from unitouch_gen.examples import example
     from unitouch_gen.files import check_file, natural
@@ -50,10 +51,12 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
         if word.startswith("example:"):
             files = [example(word.removeprefix("example:"), modality)]
         elif os.path.isdir(word):
-            known = suffixes_of(modality)
-            files = [file for file in Path(word).iterdir() if file.suffix.lower() in known and file.is_file()]
+            files = files_in(Path(word), Path(word).iterdir(), suffixes_of(modality))
         elif not os.path.lexists(word) and re.search(r"[*?[]", word):
-            files = [Path(file) for file in glob.glob(word, recursive=True) if os.path.isfile(file)]
+            folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))  # its brackets are a name's
+            pattern = str(Path(word).relative_to(folder))
+            matches = glob.glob(pattern, root_dir=folder, recursive=True)
+            files = files_in(folder, [folder / match for match in matches], suffixes_of(modality))
         else:
             check_file(name, word, "a sound file" if modality == "audio" else "an image file")
             files = [Path(word)]
@@ -62,6 +65,17 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
             raise InvalidInputError(f"`{name}` is {word!r}, where there are no {what}; name another folder or pattern.")
         found += sorted(files, key=natural)
     return found
+
+
+def files_in(folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:
+    """The files with some suffixes among paths in a folder; says how many files are left out."""
+    from unitouch_gen.files import is_hidden
+
+    files = [path for path in paths if os.path.isfile(path)]
+    kept = [file for file in files if file.suffix.lower() in suffixes and not is_hidden(file.relative_to(folder))]
+    if kept and len(kept) < len(files):
+        note(f"{len(files) - len(kept)} other files in {folder} are left out.")
+    return kept
 
 
 # Models ---------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import inspect
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,11 +65,13 @@ def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
 
 
 def value_of(word: str) -> Any:
-    """A number, a list, true or false, as in JSON; any other word is a text."""
+    """A number, a list, true or false, as in JSON or as spreadsheets write them; any other word is a text."""
+    plain = word.lower() if word in ("TRUE", "FALSE", "True", "False") else re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", word)
     try:
-        return json.loads(word)
+        value = json.loads(plain)
     except ValueError:
         return word
+    return int(value) if isinstance(value, float) and value.is_integer() else value  # 3.0: of a column with blanks
 
 
 def check_output(files: Sequence[Path], overwrite: bool) -> None:

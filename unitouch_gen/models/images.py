@@ -22,8 +22,9 @@ ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them
 def load_images(name: str, images: ImageInput) -> list[Tensor]:
     """Images as tensors (3, H, W): uint8, or float32 in [0, 1].
 
-    Accepts a path, a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3), a tensor (1 or 3, H, W) or
-    (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1. Files and PIL images with
+    Accepts a path (of an image or a .npy file), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
+    a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
+    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images with
     transparency are laid over white, as most viewers show them.
 
     Raises:
@@ -52,21 +53,32 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 
 def _decoded(name: str, image: Any) -> np.ndarray:
-    """Pixels of a file or a PIL image: uint8 (H, W, 3), or float32 (H, W) where it is deeper than 8 bits."""
+    """Pixels of a file or a PIL image: uint8 (H, W, 3), or float32 (H, W) if deeper than 8 bits; or a file's array."""
     subject = f"`{name}`" if isinstance(image, Image.Image) else f"`{name}` names {str(image)!r}, which"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
             if not isinstance(image, Image.Image):
-                image = Image.open(io.BytesIO(Path(image).read_bytes()))
+                content = Path(image).read_bytes()
+                if content.startswith(b"\x93NUMPY"):
+                    return np.load(io.BytesIO(content), allow_pickle=False)
+                image = Image.open(io.BytesIO(content))
         _check_size(name, *image.size)  # before its pixels are decoded
+        frames, deep = getattr(image, "n_frames", 1), ";16" in str(getattr(image, "tile", ""))
+        if frames > 1 and image.tell() == 0 and image.format != "MPO":  # whose others are a camera's previews
+            warnings.warn(f"{subject} has {frames} frames; its first one is used.", stacklevel=2)
         image = ImageOps.exif_transpose(image)
-        if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
-            return np.asarray(image, np.float32) / (1.0 if image.mode == "F" else 65535.0)
+        if image.mode == "F":
+            return np.asarray(image)
+        if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
+            return _by_range(subject, np.asarray(image))
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        return np.array(image.convert("RGB"))
+        pixels = np.array(image.convert("RGB"))
+        if deep and 0 < pixels.max() < 16:  # Pillow keeps the upper 8 bits of 16
+            raise InvalidInputError(f"{subject} has colours of at most 12 bits in 16; save them in 8 bits.")
+        return pixels
     except InvalidInputError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
@@ -77,6 +89,17 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         ) from error
 
 
+def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
+    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits for them."""
+    low, high = int(values.min()), int(values.max())
+    bits = next((bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits), None)
+    if low < 0 or bits is None:
+        raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers of 16 bits end at 65535.")
+    if bits < 16:
+        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {2**bits - 1}.", stacklevel=2)
+    return values.astype(np.uint8) if bits == 8 else (values / (2**bits - 1)).astype(np.float32)
+
+
 def _channels_first(name: str, array: np.ndarray) -> Tensor:
     """An array (..., H, W, C) as a tensor (..., C, H, W) that shares no memory with it."""
     if array.dtype.kind not in "uifb":
@@ -85,7 +108,9 @@ def _channels_first(name: str, array: np.ndarray) -> Tensor:
     if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
         wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
         raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
-    if array.dtype != np.uint8:
+    if array.dtype == np.uint16 and array.size and array.max() > 255:
+        pixels = _by_range(f"`{name}`", pixels)
+    elif array.dtype != np.uint8:
         pixels = pixels.astype(np.float64 if array.dtype.kind in "fb" else np.int64)
     return torch.from_numpy(pixels.copy()).movedim(-1, -3)
 

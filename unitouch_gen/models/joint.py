@@ -182,7 +182,7 @@ class UniTouchModel(PreTrainedModel):
         sensor = AddedSensor.read(as_path("file", file))
         if sensor.name in self.config.sensors:
             raise InvalidInputError(f"`file` brings {sensor.name!r}, which this model was trained with; rename it.")
-        with _READING:
+        with _READING, torch.inference_mode(False):
             touch_model, bank = self.load("touch")
             self._adopt({"sensor_bank": bank.with_added(sensor, touch_model)})
         return sensor.name
@@ -297,14 +297,14 @@ class UniTouchModel(PreTrainedModel):
         name = "pretrained_model_name_or_path"
         dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder
-        with reading(name, source), torch.inference_mode(False):  # inference tensors can never be trained
+        with reading(name, source):
             if not (source / "config.json").is_file():
                 raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
             model.source, model._stored = source, stored_tensors(source, variant)
             if "foreign" in model.config.ood_thresholds.get("touch", {}):
                 model.out_of_distribution["touch"] = RelativeDistance.from_tensors(model._stored)
-        model.to(dtype).eval()  # type: ignore[arg-type]
+            model.to(dtype).eval()  # type: ignore[arg-type]
         for modality in modalities:
             model.load(modality)
         return model

@@ -2,7 +2,6 @@
 
 import os
 import threading
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, ch
 from unitouch_gen.files import local_folder, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
-from unitouch_gen.models.videos import VIDEOS, contacts
+from unitouch_gen.models.videos import firmest
 
 LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
 
@@ -82,18 +81,11 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
-        A video, or an iterator of frames, is the firmest of its `contacts`.
+        A video, an animated image or an iterator of frames is the firmest of its `contacts`.
         """
-
-        def still(place: str, one: Any) -> Any:
-            video = isinstance(one, str | os.PathLike) and Path(one).suffix.lower() in VIDEOS
-            if not video and not isinstance(one, Iterator):
-                return one
-            return max(contacts(one, name=place), key=lambda contact: contact.firmness).frame
-
         if isinstance(touch, list | tuple):
-            return self.images([still(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
-        return self.images(still(name, touch), name=name)
+            return self.images([firmest(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
+        return self.images(firmest(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""

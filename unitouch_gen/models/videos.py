@@ -1,14 +1,19 @@
 """Videos and streams of frames of a touch sensor: its gel at rest, contacts, and the frame that shows one best."""
 
 import os
+import re
+import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image, ImageSequence
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe, first_line, needed
@@ -16,6 +21,7 @@ from unitouch_gen.files import check_file
 from unitouch_gen.models.images import ImageInput, load_images
 
 VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})  # suffixes of files
+CONTENTS = rb"....ftyp(?!hei|mif|avi)|\x1aE\xdf\xa3|RIFF....AVI |\0\0\x01[\xb3\xba]|0&\xb2u"  # how these begin; no HEIC
 LEAST_CHANGE = 2.5 / 255  # of a cell where something touches, of full scale; compression makes 1 to 2 levels of 255
 QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
 SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
@@ -52,8 +58,8 @@ def contacts(
     Each goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
 
     Args:
-        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images. It begins before
-            the first contact: the gel at rest is the median of the first frames that are alike.
+        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or of an animated image, or an iterable of
+            images. It begins before the first contact: the gel at rest is the median of the first frames that are alike.
         color: Order of the channels of arrays and tensors, "rgb" or "bgr", which is OpenCV's.
         name: Name of the argument, for the messages.
 
@@ -108,7 +114,9 @@ def contacts(
 def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: str) -> Iterator[Tensor]:
     """Frames of one size as RGB, uint8 (3, H, W)."""
     check_choice("color", color, ("rgb", "bgr"))
-    frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
+    if isinstance(frames, str | os.PathLike):
+        check_file(name, frames, "a video")
+        frames = animation(frames) or read_video(name, frames)
     if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
         raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
     size = None
@@ -122,8 +130,41 @@ def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: 
         yield pixels.flip(0) if color == "bgr" and not isinstance(frame, str | os.PathLike) else pixels
 
 
+def firmest(name: str, source: Any) -> Any:
+    """The firmest contact of a video, an animated image or an iterator of frames; any other input as it is."""
+    is_file = isinstance(source, str | os.PathLike) and os.path.isfile(source)
+    animated = animation(source) if is_file or isinstance(source, Image.Image) else None
+    if not (animated or isinstance(source, Iterator) or (is_file and is_video(source))):
+        return source
+    best = max(contacts(animated or source, name=name), key=lambda contact: contact.firmness)
+    if animated:
+        warnings.warn(f"`{name}` is an animation; its firmest contact is used, frame {best.index}.", stacklevel=2)
+    return best.frame
+
+
+def is_video(file: str | os.PathLike) -> bool:
+    """Whether a file is a video by its suffix or by how it begins."""
+    with open(file, "rb") as stream:
+        return Path(file).suffix.lower() in VIDEOS or bool(re.match(CONTENTS, stream.read(16), re.DOTALL))
+
+
+def animation(source: Any) -> list[Image.Image] | None:
+    """Frames of an animated image (GIF, APNG, WebP, pages of a TIFF) that are enough for a contact, evenly in time."""
+    try:
+        with nullcontext(source) if isinstance(source, Image.Image) else Image.open(source) as image:
+            if getattr(image, "n_frames", 1) < 2 or image.tell() > 0:  # a frame that the user has chosen
+                return None
+            frames = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]
+            image.seek(0)
+    except Exception:  # of as many kinds as there are formats; no image, or a broken one, which its reader tells
+        return None
+    unit = min((duration for _, duration in frames if duration), default=1)  # equal frames are stored as a longer one
+    evenly = [frame for frame, duration in frames for _ in range(min(max(round(duration / unit), 1), 100))]
+    return evenly if len(evenly) >= QUIET + 3 and len({frame.size for frame in evenly}) == 1 else None
+
+
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
-    """Frames (H, W, 3) of a video file, or of a camera by PyAV's name and format of it ("v4l2"), uint8 RGB.
+    """Frames (H, W, 3) of a video file, or of a camera by PyAV's name and format of it ("v4l2"), uint8 RGB, as shown.
 
     Those that cannot be decoded are left out. Raises `InvalidInputError` if it cannot be read, or PyAV is missing.
     """
@@ -132,14 +173,28 @@ def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) 
         check_file(name, place, "a video")
     options = {"protocol_whitelist": "file"} if form is None else {}  # a list of other places is no video
     try:
-        with av.open(str(place), format=form, options=options) as container:
+        # a name such as 10:30.mp4 would be of a protocol
+        with av.open(os.path.abspath(place) if form is None else str(place), format=form, options=options) as container:
             for packet in container.demux(video=0):
                 try:
                     decoded = packet.decode()
                 except av.FFmpegError:
                     continue
-                yield from (frame.to_ndarray(format="rgb24") for frame in decoded)
+                yield from (shown(frame, container.streams.video[0]) for frame in decoded)
     except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # the last of a file without a video
         raise InvalidInputError(
             f"`{name}` is {str(place)!r}, which cannot be read as a video ({first_line(error)})."
         ) from error
+
+
+def shown(frame: Any, stream: Any) -> np.ndarray:
+    """Pixels (H, W, 3) of a decoded frame as players show it, uint8 RGB: square, and turned by its display matrix."""
+    width = round(frame.width * float(stream.sample_aspect_ratio or 1))
+    pixels = frame.to_ndarray(format="rgb24", width=width)
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return pixels
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5]  # (column, row) goes to (a column + c row, b column + d row)
+    if abs(b) > abs(a):
+        pixels, a, d = pixels.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
