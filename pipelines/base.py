@@ -289,7 +289,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
         if noise is None:
-            noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)
+            single = torch.float32 if dtype == torch.float64 else dtype  # a seed is the same noise in both
+            noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=single)
         hidden_states = hidden_states.to(device, dtype)
         if class_labels is not None:
             class_labels = class_labels.to(device, dtype if class_labels.is_floating_point() else None)
@@ -399,7 +400,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         )  # diffusers' download cannot resolve our components
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
-            for part in ("unet", "vae", "embedding_bank", "backgrounds"):
+            for part in ("unet", "vae", "embedding_bank", "backgrounds", "text_encoder", "image_normalizer"):
                 if part not in kwargs:
                     check_filled(folder / part, getattr(pipe, part, None))
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
@@ -419,7 +420,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
-        Also writes two-line Python files so that `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
+        LoRA weights that are loaded are left out, and kept where they are fused. Also writes two-line Python files so that `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
         finds our classes, and a model card, README.md. Without `card`, an existing card stays; else the card that the
         pipeline was loaded with is written.
 
@@ -430,8 +431,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             check_kind("card", card, Card)
         folder = as_path("save_directory", save_directory)
         upload = kwargs.pop("push_to_hub", False)
+        plain = copy.copy(self)
+        for name, part in without_lora(self.components).items():
+            setattr(plain, name, part)
         with writing_folder("save_directory", folder) as place:
-            super().save_pretrained(place, *args, **kwargs)
+            super(UniTouchPipeline, plain).save_pretrained(place, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
                 name_classes(place)
             if card is not None or not (folder / CARD).exists():
@@ -476,6 +480,25 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self._joint("unload_sensor").unload_sensor(name)
 
 
+def without_lora(components: dict[str, Any]) -> dict[str, Any]:
+    """Networks that have LoRA layers, with the layers that these are in, fused or not, in their place.
+
+    The copies share all weights; a network in another one, as a text encoder in the joint space, stays in it.
+    """
+    networks = {name: part for name, part in components.items() if isinstance(part, torch.nn.Module)}
+    shared = {id(one): one for part in networks.values() for one in [*part.parameters(), *part.buffers()]}
+    shared |= {id(stored): stored for part in networks.values() if (stored := getattr(part, "_stored", None))}
+    plain = dict[str, Any]()
+    for name, part in networks.items():
+        if any(hasattr(module, "base_layer") for module in part.modules()):
+            plain[name] = copy.deepcopy(part, shared)
+            for module in list(plain[name].modules()):
+                for key, child in module.named_children():
+                    setattr(module, key, getattr(child, "base_layer", child))
+            plain[name]._hf_peft_config_loaded = False  # or transformers writes the LoRA weights alone
+    return plain
+
+
 def check_filled(folder: Path, network: Any) -> None:
     """Raises if a folder's files lack numbers of the network, which diffusers would draw at random."""
     if not isinstance(network, torch.nn.Module) or not folder.is_dir():
@@ -483,10 +506,11 @@ def check_filled(folder: Path, network: Any) -> None:
     sizes: dict[str, int] = {}
     for path in folder.glob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
-            for name in file.keys():  # noqa: SIM118 - not a dict
+            for name in [name for name in file.keys() if ".base_layer." not in name and ".lora_" not in name]:  # noqa: SIM118
                 sizes[name] = math.prod(file.get_slice(name).get_shape())
-    held, wanted = sum(sizes.values()), sum([tensor.numel() for tensor in network.state_dict().values()])
-    if held < wanted:
+    state = network.state_dict().values()
+    held, wanted = sum(sizes.values()), sum(tensor.numel() for tensor in state)
+    if held < wanted or any(tensor.is_meta for tensor in state):
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."

@@ -146,8 +146,8 @@ def prepare_steps(
     One of `num_inference_steps` (default 50), `timesteps`, `sigmas`, which end in 0, and `tolerance`, a relative RMS
     error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of the pipeline's own
     scheduler runs; otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of
-    a tolerance, `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): 1 runs all of them, 0 the
-    last one. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or arguments exclude each other.
+    a tolerance, `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of
+    the way to noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
@@ -170,6 +170,12 @@ def prepare_steps(
         value = check_integer(name, value, 1, levels)
     elif name != "tolerance":
         value = check_falling(name, value, levels - 1 if name == "timesteps" else math.inf)
+        total = len(value) - (name == "sigmas")
+        count = round(init_strength * total)
+        if init_strength < 1.0 and not 0 < count < total:
+            why = f"which begins at none of {total} `{name}`; pass more, or `num_inference_steps`"
+            raise InvalidInputError(f"`init_strength` is {init_strength:g}, {why}.")
+        value = value[total - count :]
     if solver is None and tolerance is None:
         return prepare_scheduler(copy.deepcopy(scheduler), name, value, eta, init_strength, device)
 
@@ -182,11 +188,10 @@ def prepare_steps(
         return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
     solver = check_choice("solver", solver, SOLVERS)
     if name == "num_inference_steps":
-        value = [*SOLVERS[solver].spacing(schedule, value), 0.0]
+        value = [*SOLVERS[solver].spacing(schedule, max(round(init_strength * value), 1), init_strength), 0.0]
     elif name == "timesteps":
         value = [*schedule.sigma(torch.tensor(value)).tolist(), 0.0]
-    count = max(round(init_strength * (len(value) - 1)), 1)
-    return Steps(solver, count, value[-count - 1 :], schedule, prediction_type, eta=eta)
+    return Steps(solver, len(value) - 1, value, schedule, prediction_type, eta=eta)
 
 
 def prepare_scheduler(
@@ -197,20 +202,35 @@ def prepare_scheduler(
     if name not in inspect.signature(scheduler.set_timesteps).parameters:
         raise InvalidInputError(f"{words}, but {kind} chooses its own steps; leave it out, or name a `solver`.")
     try:
+        if name == "num_inference_steps" and init_strength < 1.0:
+            scheduler, value = begun_within(scheduler, init_strength), max(round(init_strength * value), 1)
         scheduler.set_timesteps(**{name: value}, device=device)
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
-    if not levels / 3 <= first < levels:  # "leading" spacing starts too low with 1 step, or too high with 1000
+    if init_strength == 1.0 and not levels / 3 <= first < levels:  # "leading" spacing starts too low with 1 step, or too high with 1000
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
     steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM leaves it unset for custom timesteps
-    count = max(round(init_strength * steps), 1)
-    begin = (steps - count) * scheduler.order
     if hasattr(scheduler, "set_begin_index"):
-        scheduler.set_begin_index(begin)  # without it diffusers starts at the second of two equal timesteps
-    return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps[begin:], eta=eta)
+        scheduler.set_begin_index(0)  # without it diffusers starts at the second of two equal timesteps
+    return Steps(kind, steps, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
+
+
+def begun_within(scheduler: Any, share: float) -> Any:
+    """A diffusers scheduler of the noise levels up to a share of its spacing, at the last of which it starts."""
+    config, betas = scheduler.config, getattr(scheduler, "betas", None)
+    if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
+        raise ValueError(f"it starts at noise alone; pass no `init_strength`, which is {share:g}, or name a `solver`")
+    scheduler.set_timesteps(100)
+    spacing = scheduler.timesteps.unique()  # from the smallest
+    levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)
+    own = {"timestep_spacing": "trailing", "rescale_betas_zero_snr": False}
+    own = {name: value for name, value in own.items() if name in config}
+    return type(scheduler).from_config(
+        config, num_train_timesteps=levels, trained_betas=betas[:levels].tolist(), **own
+    )
 
 
 def check_falling(name: str, values: Any, high: float) -> list[float]:

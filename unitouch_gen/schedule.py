@@ -67,17 +67,18 @@ class NoiseSchedule:
         lower = timestep.long().clamp(max=len(self.log_sigmas) - 2)
         return torch.lerp(self.log_sigmas[lower], self.log_sigmas[lower + 1], timestep - lower).exp()
 
-    # Spacings: falling noise levels, one a step; the last step goes from the smallest of them to 0.
+    # Spacings: falling noise levels, one a step, over a share of the way from data (0) to noise (1); the last step goes
+    # from the smallest of them to 0.
 
-    def trailing(self, steps: int) -> list[float]:
+    def trailing(self, steps: int, share: float = 1.0) -> list[float]:
         """Even in time, from the last timestep, rounded as diffusers does (Lin et al., 2024, Section 3.3)."""
         levels = len(self.log_sigmas)
-        timesteps = [round(levels * (steps - step) / steps) - 1 for step in range(steps)]
+        timesteps = [round(share * levels * (steps - step) / steps) - 1 for step in range(steps)]
         return self.sigma(torch.tensor(timesteps)).tolist()
 
-    def karras(self, steps: int) -> list[float]:
+    def karras(self, steps: int, share: float = 1.0) -> list[float]:
         """Even in sigma^(1/7), so that they lie close near the smallest one (Karras et al., 2022, Equation 5)."""
-        return [self.karras_level(share) for share in torch.linspace(0.0, 1.0, steps, dtype=torch.float64).tolist()]
+        return [self.karras_level(at) for at in torch.linspace(1 - share, 1.0, steps, dtype=torch.float64).tolist()]
 
     def karras_level(self, share: float) -> float:
         """The noise level at a share of the Karras spacing, from 0 (largest) to 1 (smallest)."""

@@ -233,7 +233,7 @@ class Solver:
 
     sample: Callable[..., Tensor]
     order: int
-    spacing: Callable[[NoiseSchedule, int], list[float]]
+    spacing: Callable[[NoiseSchedule, int, float], list[float]]
 
 
 SOLVERS: dict[str, Solver] = {

@@ -71,7 +71,7 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
     blur = max(3, max(pixels.shape[-2:]) // 14 | 1)
     around = F.pad(pixels, (blur // 2,) * 4, mode="replicate")
     detail = (pixels - F.avg_pool2d(around, blur, 1)).flatten(2)
-    covariance = (detail @ detail.mT / detail.shape[-1]).nan_to_num() + 1e-9 * torch.eye(3, device=pixels.device)
+    covariance = (detail @ detail.mT / detail.shape[-1]).nan_to_num() + 1e-9 * torch.eye(3).to(pixels)
     deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
     red, green, _ = (covariance / (deviation[:, :, None] * deviation[:, None])).unbind(dim=1)
     correlations = torch.stack([red[:, 1], red[:, 2], green[:, 2]], dim=1)

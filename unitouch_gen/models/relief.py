@@ -90,7 +90,7 @@ def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
     products = both @ both.mT / both.shape[-1]
     aa, ab, bb = products[:, :channels, :channels], products[:, :channels, channels:], products[:, channels:, channels:]
     noise = 2e-3 * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + 5e-6  # of the gradients: a share, and the least
-    eye = noise[:, None, None] * torch.eye(channels, device=detail.device)
+    eye = noise[:, None, None] * torch.eye(channels).to(detail)
     whiten = torch.linalg.inv(torch.linalg.cholesky(aa + bb + eye))  # of the energy of one sum
     blocks = ((bb + eye / 2.0, -ab.mT), (-ab, aa + eye / 2.0))  # of the curl, with the half that noise has
     curl = torch.cat([torch.cat([whiten @ block @ whiten.mT for block in row], dim=2) for row in blocks], dim=1)
