@@ -420,9 +420,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
-        LoRA weights that are loaded are left out, and kept where they are fused. Also writes two-line Python files so that `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
-        finds our classes, and a model card, README.md. Without `card`, an existing card stays; else the card that the
-        pipeline was loaded with is written.
+        LoRA weights are left out, but for fused ones. Also writes two-line Python files, by which
+        `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)` finds our classes, and a model card,
+        README.md. Without `card`, an existing card stays; else that which the pipeline was loaded with is written.
 
         Raises:
             InvalidInputError: If the folder cannot be written to; what it held stays as it was.
@@ -481,21 +481,16 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
 
 def without_lora(components: dict[str, Any]) -> dict[str, Any]:
-    """Networks that have LoRA layers, with the layers that these are in, fused or not, in their place.
-
-    The copies share all weights; a network in another one, as a text encoder in the joint space, stays in it.
-    """
+    """Networks that have LoRA layers without these: copies that share all weights, fused ones too."""
     networks = {name: part for name, part in components.items() if isinstance(part, torch.nn.Module)}
     shared = {id(one): one for part in networks.values() for one in [*part.parameters(), *part.buffers()]}
-    shared |= {id(stored): stored for part in networks.values() if (stored := getattr(part, "_stored", None))}
-    plain = dict[str, Any]()
-    for name, part in networks.items():
-        if any(hasattr(module, "base_layer") for module in part.modules()):
-            plain[name] = copy.deepcopy(part, shared)
-            for module in list(plain[name].modules()):
-                for key, child in module.named_children():
-                    setattr(module, key, getattr(child, "base_layer", child))
-            plain[name]._hf_peft_config_loaded = False  # or transformers writes the LoRA weights alone
+    wrapped = {name for name, part in networks.items() if any(hasattr(one, "base_layer") for one in part.modules())}
+    plain = {name: copy.deepcopy(networks[name], shared) for name in wrapped}
+    for network in plain.values():
+        network._hf_peft_config_loaded = False  # or transformers writes the LoRA weights alone
+        for module in list(network.modules()):
+            for key, child in module.named_children():
+                setattr(module, key, getattr(child, "base_layer", child))
     return plain
 
 
@@ -506,11 +501,11 @@ def check_filled(folder: Path, network: Any) -> None:
     sizes: dict[str, int] = {}
     for path in folder.glob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
-            for name in [name for name in file.keys() if ".base_layer." not in name and ".lora_" not in name]:  # noqa: SIM118
-                sizes[name] = math.prod(file.get_slice(name).get_shape())
-    state = network.state_dict().values()
-    held, wanted = sum(sizes.values()), sum(tensor.numel() for tensor in state)
-    if held < wanted or any(tensor.is_meta for tensor in state):
+            for name in file.keys():  # noqa: SIM118 - not a dict
+                if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
+                    sizes[name] = math.prod(file.get_slice(name).get_shape())
+    held, wanted = sum(sizes.values()), sum([tensor.numel() for tensor in network.state_dict().values()])
+    if held < wanted or any(tensor.is_meta for tensor in network.state_dict().values()):
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."

@@ -62,7 +62,8 @@ class LayoutHold:
         def held(z: Tensor, timestep: Tensor) -> Tensor:
             prediction, sigma = network(z, timestep).float(), self.schedule.sigma(timestep.cpu()).item()
             denoised = to_denoised(prediction, z, sigma, self.prediction_type)
-            slope = to_denoised(torch.ones(()), torch.zeros(()), sigma, self.prediction_type).item()  # dD / dprediction
+            one = torch.ones((), dtype=torch.float32)
+            slope = to_denoised(one, 0.0 * one, sigma, self.prediction_type).item()  # dD / dprediction
             photo = self.photo.repeat(len(z) // len(self.photo), 1, 1, 1)
             return prediction + self.coarse(photo - denoised) / slope
 

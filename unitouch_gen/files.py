@@ -189,10 +189,7 @@ def read_text(file: Path) -> str:
 
 
 def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
-    """The rows of a table by the names in its first line, or others, without blank rows and columns at its end.
-
-    Columns are parted by commas, semicolons or tabs.
-    """
+    """The rows of a table, parted by commas, semicolons or tabs, by the names in its first line; without blank ones."""
     text = read_text(file)
     if said := re.match(r'"?sep=(.)"?\r?\n', text):  # to Excel
         text = text[said.end() :]
@@ -207,8 +204,7 @@ def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str
     names, cells = names[:width], [row[:width] for row in cells]
     odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
     if not cells or odd or len(set(names)) < len(names):
-        rows = ", ".join(odd[:5]) + (f" and {len(odd) - 5} more" if len(odd) > 5 else "")
-        wrong = f"other columns in row {rows}; quote texts that hold commas" if odd else "two of one name"
+        wrong = f"other columns in row {', '.join(odd[:5])}; quote texts that hold commas" if odd else "two of one name"
         raise InvalidInputError(f"{str(file)!r} has the columns {[*names]}, and {wrong if cells else 'no rows'}.")
     return [dict(zip(names, row, strict=True)) for row in cells]
 

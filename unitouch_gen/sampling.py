@@ -147,7 +147,8 @@ def prepare_steps(
     error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of the pipeline's own
     scheduler runs; otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of
     a tolerance, `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of
-    the way to noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or arguments exclude each other.
+    the way to noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or
+    `InvalidTypeError` if steps are impossible or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
@@ -173,8 +174,7 @@ def prepare_steps(
         total = len(value) - (name == "sigmas")
         count = round(init_strength * total)
         if init_strength < 1.0 and not 0 < count < total:
-            why = f"which begins at none of {total} `{name}`; pass more, or `num_inference_steps`"
-            raise InvalidInputError(f"`init_strength` is {init_strength:g}, {why}.")
+            raise InvalidInputError(f"`init_strength` is {init_strength:g}, which begins at none of {total} `{name}`.")
         value = value[total - count :]
     if solver is None and tolerance is None:
         return prepare_scheduler(copy.deepcopy(scheduler), name, value, eta, init_strength, device)
@@ -208,7 +208,8 @@ def prepare_scheduler(
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
-    if init_strength == 1.0 and not levels / 3 <= first < levels:  # "leading" spacing starts too low with 1 step, or too high with 1000
+    # "leading" spacing starts too low with 1 step, or too high with 1000
+    if init_strength == 1.0 and not levels / 3 <= first < levels:
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
@@ -226,11 +227,9 @@ def begun_within(scheduler: Any, share: float) -> Any:
     scheduler.set_timesteps(100)
     spacing = scheduler.timesteps.unique()  # from the smallest
     levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)
-    own = {"timestep_spacing": "trailing", "rescale_betas_zero_snr": False}
-    own = {name: value for name, value in own.items() if name in config}
-    return type(scheduler).from_config(
-        config, num_train_timesteps=levels, trained_betas=betas[:levels].tolist(), **own
-    )
+    own = {"num_train_timesteps": levels, "trained_betas": betas[:levels].tolist(), "timestep_spacing": "trailing",
+           "rescale_betas_zero_snr": False}  # fmt: skip
+    return type(scheduler).from_config(config, **{name: value for name, value in own.items() if name in config})
 
 
 def check_falling(name: str, values: Any, high: float) -> list[float]:

@@ -89,7 +89,7 @@ def batch(
 
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
-    """The columns of every file of a folder and those below, but for the output, which names its picture by its place."""
+    """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     paths = [file for file in sorted(folder.rglob("*")) if output.resolve() not in file.resolve().parents]

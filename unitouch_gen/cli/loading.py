@@ -54,8 +54,7 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
             files = files_in(Path(word), Path(word).iterdir(), suffixes_of(modality))
         elif not os.path.lexists(word) and re.search(r"[*?[]", word):
             folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))  # its brackets are a name's
-            pattern = str(Path(word).relative_to(folder))
-            matches = glob.glob(pattern, root_dir=folder, recursive=True)
+            matches = glob.glob(str(Path(word).relative_to(folder)), root_dir=folder, recursive=True)
             files = files_in(folder, [folder / match for match in matches], suffixes_of(modality))
         else:
             check_file(name, word, "a sound file" if modality == "audio" else "an image file")

@@ -22,7 +22,7 @@ ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them
 def load_images(name: str, images: ImageInput) -> list[Tensor]:
     """Images as tensors (3, H, W): uint8, or float32 in [0, 1].
 
-    Accepts a path (of an image or a .npy file), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
+    Accepts a path (image or .npy), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
     a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
     files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images with
     transparency are laid over white, as most viewers show them.
@@ -64,9 +64,8 @@ def _decoded(name: str, image: Any) -> np.ndarray:
                     return np.load(io.BytesIO(content), allow_pickle=False)
                 image = Image.open(io.BytesIO(content))
         _check_size(name, *image.size)  # before its pixels are decoded
-        frames, deep = getattr(image, "n_frames", 1), ";16" in str(getattr(image, "tile", ""))
-        if frames > 1 and image.tell() == 0 and image.format != "MPO":  # whose others are a camera's previews
-            warnings.warn(f"{subject} has {frames} frames; its first one is used.", stacklevel=2)
+        if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
+            warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
         image = ImageOps.exif_transpose(image)
         if image.mode == "F":
             return np.asarray(image)
@@ -75,10 +74,7 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        pixels = np.array(image.convert("RGB"))
-        if deep and 0 < pixels.max() < 16:  # Pillow keeps the upper 8 bits of 16
-            raise InvalidInputError(f"{subject} has colours of at most 12 bits in 16; save them in 8 bits.")
-        return pixels
+        return np.array(image.convert("RGB"))
     except InvalidInputError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
@@ -90,11 +86,11 @@ def _decoded(name: str, image: Any) -> np.ndarray:
 
 
 def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
-    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits for them."""
+    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
     low, high = int(values.min()), int(values.max())
-    bits = next((bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits), None)
-    if low < 0 or bits is None:
-        raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers of 16 bits end at 65535.")
+    if low < 0 or high >= 1 << 16:
+        raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
+    bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
     if bits < 16:
         warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {2**bits - 1}.", stacklevel=2)
     return values.astype(np.uint8) if bits == 8 else (values / (2**bits - 1)).astype(np.float32)

@@ -67,21 +67,15 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         raise InvalidInputError(f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), T at least 2.")
     full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
     with np.errstate(all="ignore"):
-        samples = (_mono(np.atleast_2d(samples)) / full_scale).astype(np.float32)
+        channels = np.atleast_2d(samples)
+        mean, power = channels.mean(axis=0), channels.var(axis=1)
+        cancelled = mean.var() < power.mean() / (2 * len(channels))  # as of a microphone that is wired upside down
+        samples = ((channels[power.argmax()] if cancelled else mean) / full_scale).astype(np.float32)
     if not np.isfinite(samples).all():
         raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
     if (peak := np.abs(samples).max()) > 100:
         raise InvalidInputError(f"`{name}` holds samples up to {peak:g}; floats run from -1 to 1, or pass integers.")
     return Sound(samples, rate)
-
-
-def _mono(channels: np.ndarray) -> np.ndarray:
-    """The mean of channels (C, T); where they cancel, as those of a microphone that is wired upside down, the loudest.
-
-    Of channels that have nothing in common, the mean has 1 / C of their power.
-    """
-    mean, power = channels.mean(axis=0, dtype=np.float64), channels.var(axis=1, dtype=np.float64)
-    return channels[power.argmax()] if mean.var() < power.mean() / (2 * len(channels)) else mean
 
 
 def _read(name: str, file: str | os.PathLike) -> tuple[np.ndarray, int]:

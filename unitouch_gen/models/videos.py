@@ -58,8 +58,8 @@ def contacts(
     Each goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
 
     Args:
-        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or of an animated image, or an iterable of
-            images. It begins before the first contact: the gel at rest is the median of the first frames that are alike.
+        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images. It begins before
+            the first contact: the gel at rest is the median of the first frames that are alike.
         color: Order of the channels of arrays and tensors, "rgb" or "bgr", which is OpenCV's.
         name: Name of the argument, for the messages.
 
@@ -114,9 +114,7 @@ def contacts(
 def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: str) -> Iterator[Tensor]:
     """Frames of one size as RGB, uint8 (3, H, W)."""
     check_choice("color", color, ("rgb", "bgr"))
-    if isinstance(frames, str | os.PathLike):
-        check_file(name, frames, "a video")
-        frames = animation(frames) or read_video(name, frames)
+    frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
     if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
         raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
     size = None
@@ -132,35 +130,32 @@ def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: 
 
 def firmest(name: str, source: Any) -> Any:
     """The firmest contact of a video, an animated image or an iterator of frames; any other input as it is."""
-    is_file = isinstance(source, str | os.PathLike) and os.path.isfile(source)
-    animated = animation(source) if is_file or isinstance(source, Image.Image) else None
-    if not (animated or isinstance(source, Iterator) or (is_file and is_video(source))):
+    frames = source if isinstance(source, Iterator) else moving(source)
+    if frames is None:
         return source
-    best = max(contacts(animated or source, name=name), key=lambda contact: contact.firmness)
-    if animated:
+    best = max(contacts(frames, name=name), key=lambda contact: contact.firmness)
+    if isinstance(frames, list):
         warnings.warn(f"`{name}` is an animation; its firmest contact is used, frame {best.index}.", stacklevel=2)
     return best.frame
 
 
-def is_video(file: str | os.PathLike) -> bool:
-    """Whether a file is a video by its suffix or by how it begins."""
-    with open(file, "rb") as stream:
-        return Path(file).suffix.lower() in VIDEOS or bool(re.match(CONTENTS, stream.read(16), re.DOTALL))
-
-
-def animation(source: Any) -> list[Image.Image] | None:
-    """Frames of an animated image (GIF, APNG, WebP, pages of a TIFF) that are enough for a contact, evenly in time."""
-    try:
-        with nullcontext(source) if isinstance(source, Image.Image) else Image.open(source) as image:
+def moving(source: Any) -> Any:
+    """The path of a video, or frames of an animated image (GIF, APNG, WebP, TIFF) if enough for a contact, or `None`."""
+    is_file = isinstance(source, str | os.PathLike) and os.path.isfile(source)
+    with open(source, "rb") if is_file else nullcontext(source) as opened:
+        if is_file and (Path(source).suffix.lower() in VIDEOS or re.match(CONTENTS, opened.read(16), re.DOTALL)):
+            return source
+        try:
+            image = Image.open(opened) if is_file else opened
             if getattr(image, "n_frames", 1) < 2 or image.tell() > 0:  # a frame that the user has chosen
                 return None
-            frames = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]
+            stored = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]
             image.seek(0)
-    except Exception:  # of as many kinds as there are formats; no image, or a broken one, which its reader tells
-        return None
-    unit = min((duration for _, duration in frames if duration), default=1)  # equal frames are stored as a longer one
-    evenly = [frame for frame, duration in frames for _ in range(min(max(round(duration / unit), 1), 100))]
-    return evenly if len(evenly) >= QUIET + 3 and len({frame.size for frame in evenly}) == 1 else None
+        except Exception:  # of as many kinds as there are formats; `load_images` tells them
+            return None
+    unit = min((duration for _, duration in stored if duration), default=1)  # equal frames are stored as a longer one
+    frames = [frame for frame, duration in stored for _ in range(min(max(round(duration / unit), 1), 100))]
+    return frames if len(frames) >= QUIET + 3 and len({frame.size for frame in frames}) == 1 else None
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
