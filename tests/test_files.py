@@ -20,6 +20,7 @@ from unitouch_gen.files import (
     local_folder,
     natural,
     read_settings,
+    read_table,
     reading,
     replacing,
     write_file,
@@ -159,3 +160,26 @@ def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_
     with pytest.raises(InvalidInputError, match=r"^`--model` is .*, which cannot be loaded: no file$"):  # noqa: SIM117
         with reading("--model", tmp_path), reading("pretrained_model_name_or_path", tmp_path):
             raise OSError("no file")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "Touch,Seed\na.png,1\n\n", "touch;seed\r\na.png;1\r\n", "touch\tseed\ra.png\t1\r", "sep=;\ntouch;seed\na.png;1",
+        "touch,seed,,\na.png,1,,\n,,,", '"sep=|"\ntouch|seed\n"a.png"|1', "\n touch , seed\na.png, 1",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_tables_are_read_as_spreadsheets_write_them(tmp_path, content, encoding):
+    (tmp_path / "list.csv").write_bytes(content.encode(encoding))
+    assert read_table(tmp_path / "list.csv") == [{"touch": "a.png", "seed": "1"}]
+
+
+def test_what_is_no_table_is_refused(tmp_path):
+    for content, words in (
+        (b"a,b\n1\n", "other columns in row 1"), (b"a,a\n1,2", "two of one name"), (b"a,b", "no rows"),
+        (b'a\n"b', "is no table: .*line 2"), ("käfer\n1".encode("cp1252"), "save it as UTF-8"),
+    ):  # fmt: skip
+        (tmp_path / "list.csv").write_bytes(content)
+        with pytest.raises(InvalidInputError, match=words):
+            read_table(tmp_path / "list.csv")

@@ -11,6 +11,7 @@ import soundfile
 import torch
 from PIL import Image
 
+from tests.helpers import recordings
 from tests.helpers.processes import Child, finished
 from tests.helpers.processes import command as commanded
 
@@ -43,6 +44,28 @@ def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
     alone = pipes["touch-to-image"]("in/dark.png", "rough, brick", sensor="digit", strength=0.5, num_inference_steps=3,
                                     generator=seed).images[0]  # fmt: skip
     assert abs(np.asarray(alone, dtype=int) - np.asarray(Image.open("out/walls/one.png"))).max() <= 1
+
+
+def test_cells_are_read_as_spreadsheets_write_them(here, run, files):
+    """Semicolons and decimal commas of other countries, and numbers of a column with blanks as pandas writes them."""
+    (here / "TABLE.CSV").write_text(
+        "\ufeffTouch;seed;strength;bridge\nin/dark.png;5.0;0,5;FALSE\n;;;\n", encoding="utf-8"
+    )
+    assert run("TABLE.CSV") == (0, f"1 of 1 pictures are in {here / 'out'}\n", "")
+    (line,) = lines(here / "out")
+    assert (line["seed"], line["strength"], line["bridge"]) == (5, 0.5, False)
+
+
+def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, files):
+    """A video goes with the pictures."""
+    pytest.importorskip("av")
+    for name in ("._a.png", ".DS_Store", "@eaDir/dark.png", ".ipynb_checkpoints/dark-checkpoint.png", "out/old.png"):
+        (here / "in" / name).parent.mkdir(exist_ok=True)
+        (here / "in" / name).write_bytes((here / "in" / "dark.png").read_bytes())
+    recordings.write(here / "in" / "press.MP4", list(recordings.frames()))
+    code, _, err = run("in", "-o", "in/out")
+    assert (code, err) == (0, "unitouch-gen: 4 other files in in are left out.\n")
+    assert files(here / "in" / "out") == ["bright.png", "dark.png", "manifest.jsonl", "old.png", "press.png"]
 
 
 def test_lines_of_json_and_folders_for_x_to_touch(here, run, files):

@@ -118,6 +118,7 @@ def test_a_sensor_of_ones_own_is_added_for_a_command(here, run, models, named):
     [
         ("in", ["9", "10", "a[1]", "bright", "dark"]),
         ("in/*.png **/br*", ["10", "a[1]", "bright", "dark", "bright-2"]),
+        ("in[7]/b* in[7]/*", ["bright", "9", "10", "a[1]", "bright-2", "dark"]),
         ("in/a[1].png in/press.mp4", ["a[1]", "press"]),
         ("example:brick example:digit_wood", ["gelsight_brick", "digit_wood"]),
     ],
@@ -125,12 +126,22 @@ def test_a_sensor_of_ones_own_is_added_for_a_command(here, run, models, named):
 def test_words_stand_for_files(here, run, words, stems):
     for name in ("10.png", "9.PNG", "a[1].png"):
         shutil.copy("in/dark.png", f"in/{name}")
-    (here / "in" / "notes.txt").touch()
+    for name in ("._a.png", "Thumbs.db", "notes.txt"):
+        (here / "in" / name).touch()
+    if "[7]" in words:
+        (here / "in").rename("in[7]")
     if "press" in words:
         pytest.importorskip("av")
         recordings.write(here / "in" / "press.mp4", list(recordings.frames()))
     rows = run(f"touch-to-image {words} -o out")["pictures"]
     assert [Path(row["picture"]).stem for row in rows] == stems
+
+
+def test_what_is_left_out_of_a_folder_is_counted(here, command, models):
+    for name in ("._dark.png", ".DS_Store", "notes.txt"):
+        (here / "in" / name).touch()
+    code, _, err = command("touch-to-image", "in", "-o", "out", "--steps", 1, "--model", models["touch-to-image"])
+    assert (code, err) == (0, "unitouch-gen: 3 other files in in are left out.\n")
 
 
 # Files, and what is printed -------------------------------------------------------------------------------------------

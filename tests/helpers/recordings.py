@@ -1,6 +1,7 @@
 """Recordings of a gel that is pressed, of which the firmest frame is known, as frames and as video files."""
 
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -28,18 +29,18 @@ def rest() -> np.ndarray:
     return next(frames(noise=0.0))
 
 
-def write(file: Path, images: Sequence[np.ndarray], left_out: Sequence[int] = ()) -> Path:
-    """Writes a video of 30 frames a second, without some frames, whose time passes all the same."""
+def write(file: Path, images: Sequence[np.ndarray], pixel_aspect: int = 1) -> Path:
+    """Writes a video of 30 frames a second, of pixels that are as much wider than high."""
     import av
 
     with av.open(str(file), "w") as container:
         stream = container.add_stream("mpeg4", rate=30)
         stream.height, stream.width = images[0].shape[:2]
         stream.bit_rate, stream.gop_size = 4_000_000, 1
+        stream.codec_context.sample_aspect_ratio = Fraction(pixel_aspect)
         for number, image in enumerate(images):
-            if number not in left_out:
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-                frame.pts = number
-                container.mux(stream.encode(frame))
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            frame.pts = number
+            container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return file

@@ -95,6 +95,28 @@ def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: Un
             torch.testing.assert_close(processor.raw_images(given), pixels_of(values), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("bits", "dtype"), [(8, np.int32), (8, np.uint16), (10, np.uint16), (12, np.uint16), (14, np.uint16)]
+)
+def test_full_scale_of_deep_greys_is_that_of_the_bits_they_use(processor: UniTouchProcessor, tmp_path, bits, dtype):
+    """Of a file as of its array, and told; an ending is not needed."""
+    values = (np.linspace(0.6, 1, 32 * 32).reshape(32, 32) * (2**bits - 1)).astype(dtype)
+    Image.fromarray(values).save(tmp_path / "grey.tif")
+    np.save(tmp_path / "grey.npy", values)
+    (tmp_path / "grey.tif").rename(tmp_path / "grey")
+    with pytest.warns(UserWarning, match=f"full scale is taken to be {2**bits - 1}"):
+        found = processor.raw_images([tmp_path / "grey", *([values, tmp_path / "grey.npy"] if bits > 8 else [])])
+    torch.testing.assert_close(found, pixels_of(values / (2**bits - 1)).expand_as(found), rtol=0, atol=1e-6)
+
+
+def test_a_photo_that_moves_is_its_first_frame_and_told(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    first, other = Image.fromarray(PICTURE), Image.fromarray(255 - PICTURE)
+    first.save(tmp_path / "photo.png", save_all=True, append_images=[other])
+    with pytest.warns(UserWarning, match="has 2 frames"):
+        found = processor.touch(tmp_path / "photo.png")  # too few for a contact
+    torch.testing.assert_close(denormalise_pixels(found), pixels_of(PICTURE / 255), rtol=0, atol=1e-5)
+
+
 def test_a_camera_held_sideways_is_turned_back(processor: UniTouchProcessor, tmp_path: Path) -> None:
     """By EXIF's own table: which visual edges the stored row 0 and column 0 are (bottom, right; right, top)."""
     exif = Image.Exif()
@@ -157,6 +179,7 @@ REFUSED = [
     *((bad(value), "holds 1 of 768 values that are NaN or infinite") for value in (np.nan, -np.inf)),
     *((bad(*values), RANGE) for values in ((1.5,), (-0.1,), (300, int), (-1, int), (2**63, np.uint64), (1e300, float))),
     (torch.full((3, 16, 16), 255.0), RANGE),
+    *((Image.fromarray(np.full((16, 16), value, np.int32)), "from 0 to 65535") for value in (-1, 70_000)),
     (Image.fromarray(np.full((16, 16), 99.0, np.float32)), RANGE),
     *((np.zeros(shape), SHAPE) for shape in ((16, 16, 2), (3, 16, 16), (16,), (1, 1, 16, 16, 3), (0, 16, 16, 3))),
     *((torch.zeros(shape), SHAPE) for shape in ((16, 16), (4, 16, 16), (16, 16, 3), (0, 3, 16, 16))),

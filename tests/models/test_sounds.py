@@ -131,6 +131,12 @@ def test_a_file_is_read_with_its_rate_and_channels(suffix: str, tmp_path: Path) 
         np.testing.assert_allclose(sound.samples, (left + right) / 2, atol=tolerance)
 
 
+@pytest.mark.parametrize(("other", "expected"), [(-1.0, 1.0), (-0.99, 1.0), (-1.5, -1.5), (0.0, 0.5), (1.0, 1.0)])
+def test_channels_that_cancel_are_the_loudest_of_them(other: float, expected: float) -> None:
+    (sound,) = load_sounds("audio", (np.stack([NOISE, other * NOISE]), RATE))
+    np.testing.assert_allclose(sound.samples, expected * NOISE, atol=1e-6)
+
+
 FILES = {"empty": b"", "text": b"not a sound", "header": b"RIFF\0\0\0\0WAVE"}
 NON_FINITE = [np.where(np.arange(RATE) == 7, value, NOISE.astype(np.float64)) for value in (np.nan, 1e300)]
 
@@ -140,6 +146,7 @@ REFUSED: list[tuple[object, str]] = [
     *((name, "names .*cannot be read as a sound") for name in FILES),
     *(((samples, RATE), "holds samples that are NaN or infinite") for samples in NON_FINITE),
     (NOISE, "without a sampling rate"),
+    ((32_767 * NOISE, RATE), "holds samples up to 32767; floats run from -1 to 1"),
     *(((NOISE, rate), f"sampling rate` is {rate}") for rate in (999, 768_001, 16_000.0, True)),
     *(((np.zeros(shape), RATE), "has to be") for shape in ((1,), (2, 0), (2, 2, 50), (500, 2))),
     *(((np.zeros(9, dtype), RATE), "signed integers") for dtype in (complex, bool, np.uint8)),

@@ -1,15 +1,20 @@
 """The frame of firmest contact of recordings whose firmest frame is known."""
 
+import struct
 from collections import Counter
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.helpers import recordings
 from tests.helpers.recordings import FIRMEST
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.videos import Contact, contacts, read_video
+from unitouch_gen.training.data.records import Frame
 
 
 def firmest_contact(frames, color="rgb") -> Contact:
@@ -59,6 +64,56 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     assert abs(contact.frame.astype(int) - images[contact.index]).mean() < 3
     expected = processor.touch([contact.frame, firmest_contact(images).frame])
     assert (processor.touch([file, recordings.frames()]) == expected).all()
+
+
+def shown_as(file: Path, *matrix: int) -> None:
+    """Writes the first two rows of the display matrix, (a, b, c, d), into the track header of an MP4 file."""
+    content = file.read_bytes()
+    at = content.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
+    a, b, c, d = (struct.pack(">i", value << 16) for value in matrix)
+    file.write_bytes(content[:at] + a + b + bytes(4) + c + d + content[at + 20 :])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "turned"),
+    [
+        ((0, 1, -1, 0), lambda frame: np.rot90(frame, -1)), ((0, -1, 1, 0), np.rot90), ((-1, 0, 0, 1), np.fliplr),
+        ((-1, 0, 0, -1), lambda frame: np.rot90(frame, 2)), ((0, 1, 1, 0), lambda frame: frame.transpose(1, 0, 2)),
+    ],
+)  # fmt: skip
+def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
+    """In the reader of data sets, too; and its name is no address."""
+    pytest.importorskip("av")
+    file = recordings.write(tmp_path / "10:30 [a].mp4", list(recordings.frames()))
+    stored = list(read_video("touch", file))
+    shown_as(file, *matrix)
+    for one, other in zip(read_video("touch", file), stored, strict=True):
+        np.testing.assert_array_equal(one, turned(other))
+    np.testing.assert_array_equal(Frame(str(file), index=9).read().permute(1, 2, 0), turned(stored[9]))
+
+
+def test_pixels_of_a_video_are_made_square(tmp_path):
+    file = recordings.write(tmp_path / "wide.mkv", list(recordings.frames()), pixel_aspect=2)
+    assert (
+        next(read_video("touch", file)).shape == Frame(str(file), index=0).read().permute(1, 2, 0).shape == (48, 128, 3)
+    )
+
+
+@pytest.mark.parametrize("kind", ["gif", "png", "webp", "tiff", "mp4"])
+def test_images_that_move_are_videos_by_any_name(tmp_path, kind):
+    """Equal frames are stored as a longer one; they count by their time."""
+    images = list(recordings.frames(noise=0.0))
+    if kind == "mp4":
+        recordings.write(tmp_path / "press.mp4", images)
+    else:
+        first, *others = map(Image.fromarray, images)
+        options = {} if kind == "tiff" else {"duration": 40, "lossless": True}
+        first.save(tmp_path / f"press.{kind}", save_all=True, append_images=others, **options)
+    file = (tmp_path / f"press.{kind}").rename(tmp_path / "press")
+    with nullcontext() if kind == "mp4" else pytest.warns(UserWarning, match=r"contact is used, frame (19|20|21)"):
+        found = UniTouchProcessor(image_size=32).touch(file)
+    expected = UniTouchProcessor(image_size=32).touch(images[FIRMEST])
+    assert (found - expected).abs().mean() < 0.1
 
 
 def test_what_holds_no_contact_is_refused():

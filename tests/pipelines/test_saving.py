@@ -113,6 +113,53 @@ def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(t
             load(there)
 
 
+@pytest.mark.parametrize("fused", [False, True])
+def test_weights_are_saved_under_their_own_names_whatever_is_loaded_beside_them(pipe, touch, tmp_path, fused):
+    """Base weights with LoRA loaded, fused ones after fusing; over its own folder, too. diffusers' own is refused."""
+    config = pytest.importorskip("peft").LoraConfig(target_modules=["to_q", "q_proj"], init_lora_weights=False)
+    call = Call(pipe, {"touch": touch})
+    before = call.latents()
+    pipe.register_modules(text_encoder=pipe.unitouch.load("text")[0].text_model)  # as in the built-in family
+    base = call.latents()
+    pipe.save_pretrained(tmp_path / "own")
+    pipe.unet.add_adapter(config, "made"), pipe.text_encoder.add_adapter(config, "made")
+    if fused:
+        pipe.fuse_lora()
+    drawn = call.latents()
+    assert not torch.allclose(base, drawn, atol=1e-3) and not torch.allclose(base, before, atol=1e-3)
+    pipe.save_pretrained(tmp_path / "own")
+    assert torch.equal(call.latents(), drawn)
+    found = Call(load(tmp_path / "own"), call.inputs)
+    assert_close(found.latents(), drawn if fused else base, atol=1e-4, rtol=1e-4)
+    assert all(found.pipe.unitouch.load(modality) for modality in ("text", "touch"))
+    pipe.unet.save_pretrained(tmp_path / "own" / "unet")
+    with pytest.raises(InvalidInputError, match=r"unet. holds \d+ of the \d+ numbers"):
+        load(tmp_path / "own")
+
+
+def test_what_is_read_and_called_in_inference_mode_can_be_trained(family, touch):
+    with torch.inference_mode():
+        pipe = load(family, dtype=torch.bfloat16)
+        Call(pipe, {"touch": touch}).latents()
+    assert not [key for key, value in tensors(pipe.to(torch.float32)).items() if value.is_inference()]
+    assert not any(part.is_inference() for part in pipe.unitouch.state_dict().values())
+    pixels = pipe.processor.touch(touch).requires_grad_()
+    pipe.unitouch.get_touch_features(pixels).sum().backward()
+    assert pixels.grad.abs().sum() > 0 and pipe.unitouch.touch_model.projection.weight.grad is not None
+
+
+def test_a_default_dtype_and_float64_weights_draw_the_same_picture(call):
+    expected = call.latents()
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert_close(call.latents(), expected, atol=1e-6, rtol=0)
+    finally:
+        torch.set_default_dtype(before)
+    call.pipe.to(torch.float64)
+    assert_close(call.latents(), expected, atol=1e-3, rtol=0)
+
+
 @pytest.mark.filterwarnings("ignore:`torch_dtype` is deprecated:FutureWarning")
 @pytest.mark.parametrize("name", ["dtype", "torch_dtype"])
 def test_networks_are_read_in_the_dtype_asked_for(family, name):

@@ -73,6 +73,14 @@ def test_steps_that_cannot_be_made_are_refused():
         ({"max_evaluations": 9}, "`max_evaluations` is 9, but needs a `tolerance`"),
         ({"eta": 2.0}, "`eta` is 2"),
         ({"init_strength": -1.0}, "`init_strength` is -1"),
+        *(
+            (
+                {"init_strength": 0.5, "timesteps": [900], "solver": solver, "scheduler": DDPMScheduler()},
+                "begins at none of",
+            )
+            for solver in (None, "ddim")
+        ),
+        ({"init_strength": 0.5, "scheduler": FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),
         ({"scheduler": DDIMScheduler(steps_offset=1), "num_inference_steps": 1000}, "1000, with .* timestep 1000 of"),
         ({"scheduler": EulerDiscreteScheduler(timestep_spacing="leading"), "num_inference_steps": 1}, "timestep 0 of"),
     ):
@@ -96,6 +104,34 @@ def test_strength_is_the_share_of_steps_that_is_made():
         assert steps.count == count == (len(steps.timesteps) if solver is None else len(steps.sigmas) - 1)
 
 
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.3])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"solver": "ddim"}, {"solver": "unipc"}, {"scheduler": DDIMScheduler(**STABLE_DIFFUSION)},
+        {"scheduler": PNDMScheduler(skip_prk_steps=True, **STABLE_DIFFUSION)}, {"scheduler": HeunDiscreteScheduler()},
+        {"scheduler": UniPCMultistepScheduler(use_exponential_sigmas=True, prediction_type="v_prediction")},
+        {"scheduler": EulerDiscreteScheduler(use_karras_sigmas=True)},
+    ],
+)  # fmt: skip
+def test_a_start_lies_at_its_share_whatever_the_number_of_steps(how, share):
+    def start(count: int) -> float:
+        steps = prepare_steps(how.get("scheduler", OWN), solver=how.get("solver"), num_inference_steps=count,
+                              init_strength=share)  # fmt: skip
+        assert steps.count == max(round(share * count), 1)
+        if steps.scheduler is None:
+            return math.log(steps.sigmas[0])
+        signal, noise = (steps.scheduler.add_noise(*pair, steps.timesteps[:1]).item()
+                         for pair in ((torch.ones(1), torch.zeros(1)), (torch.zeros(1), torch.ones(1))))  # fmt: skip
+        return math.log(noise / signal)
+
+    starts = [start(count) for count in (1, 2, 3, 4, 10, 50)]
+    assert max(starts) - min(starts) < 1e-3
+    whole = prepare_steps(how.get("scheduler", OWN), solver=how.get("solver"), num_inference_steps=100)
+    if whole.scheduler is None:
+        assert starts[0] == pytest.approx(math.log(whole.sigmas[round(100 * (1 - share))]), abs=0.1)
+
+
 # The run --------------------------------------------------------------------------------------------------------------
 
 
@@ -115,10 +151,15 @@ def test_a_scheduler_runs_in_the_loop_of_diffusers(kind, strength):
     found, again = (run(problem=MIXTURE, prepared=steps, init=init, generator=seeded())[0] for _ in range(2))
     assert torch.equal(found, again) and scheduler.num_inference_steps != 6
 
-    scheduler.set_timesteps(6)
-    timesteps = scheduler.timesteps[round(6 * (1 - strength)) * scheduler.order :]
+    if init is None:
+        scheduler.set_timesteps(6)
+    else:  # of the same noise levels, as far as the first
+        reach = int(steps.timesteps[0]) + 1
+        torch.testing.assert_close(steps.scheduler.alphas_cumprod, scheduler.alphas_cumprod[:reach])
+        scheduler = steps.scheduler
+    timesteps = scheduler.timesteps
     if hasattr(scheduler, "set_begin_index"):
-        scheduler.set_begin_index(len(scheduler.timesteps) - len(timesteps))
+        scheduler.set_begin_index(0)
     latents = noise * scheduler.init_noise_sigma if init is None else scheduler.add_noise(init, noise, timesteps[:1])
     options = {"generator": seeded()} if kind in (DDPMScheduler, EulerAncestralDiscreteScheduler) else {}
     for timestep in timesteps:

@@ -140,7 +140,7 @@ def firmest(name: str, source: Any) -> Any:
 
 
 def moving(source: Any) -> Any:
-    """The path of a video, or frames of an animated image (GIF, APNG, WebP, TIFF) if enough for a contact, or `None`."""
+    """The path of a video, or frames of an animated image (GIF, APNG, TIFF) if enough for a contact; or `None`."""
     is_file = isinstance(source, str | os.PathLike) and os.path.isfile(source)
     with open(source, "rb") if is_file else nullcontext(source) as opened:
         if is_file and (Path(source).suffix.lower() in VIDEOS or re.match(CONTENTS, opened.read(16), re.DOTALL)):
