@@ -140,7 +140,7 @@ def test_words_stand_for_files(here, run, words, stems):
 def test_what_is_left_out_of_a_folder_is_counted(here, command, models):
     for name in ("._dark.png", ".DS_Store", "notes.txt"):
         (here / "in" / name).touch()
-    code, _, err = command("touch-to-image", "in", "-o", "out", "--steps", 1, "--model", models["touch-to-image"])
+    code, _, err = command("touch-to-image", "in", "-o", "out", "--steps", 2, "--model", models["touch-to-image"])
     assert (code, err) == (0, "unitouch-gen: 3 other files in in are left out.\n")
 
 
