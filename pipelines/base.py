@@ -487,7 +487,7 @@ def without_lora(components: dict[str, Any]) -> dict[str, Any]:
     wrapped = {name for name, part in networks.items() if any(hasattr(one, "base_layer") for one in part.modules())}
     plain = {name: copy.deepcopy(networks[name], shared) for name in wrapped}
     for network in plain.values():
-        network._hf_peft_config_loaded = False  # or transformers writes the LoRA weights alone
+        network._hf_peft_config_loaded = False  # type: ignore[assignment]  # or transformers writes LoRA weights alone
         for module in list(network.modules()):
             for key, child in module.named_children():
                 setattr(module, key, getattr(child, "base_layer", child))

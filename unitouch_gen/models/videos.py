@@ -149,7 +149,7 @@ def moving(source: Any) -> Any:
             image = Image.open(opened) if is_file else opened
             if getattr(image, "n_frames", 1) < 2 or image.tell() > 0:  # a frame that the user has chosen
                 return None
-            stored = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]
+            stored = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]  # type: ignore[arg-type]
             image.seek(0)
         except Exception:  # of as many kinds as there are formats; `load_images` tells them
             return None
