@@ -79,7 +79,7 @@ def test_no_sample_replaces_a_tracked_picture_unasked():
 def test_samples_run(file, tmp_path):
     if file.stem in NOT_RUN:
         pytest.skip(NOT_RUN[file.stem])
-    finished(Child(script, file.read_text(), "--output", "picture.png", folder=tmp_path))
+    finished(Child(script, file, "--output", "picture.png", folder=tmp_path))
     assert (tmp_path / "picture.png").is_file()
 
 
@@ -88,7 +88,7 @@ def test_samples_run(file, tmp_path):
 def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
     """Within less than another seed makes (1.8 and more): after new weights, they have to be drawn anew."""
     words = ["--pipeline", name, "--output", "drawn.jpg"]
-    finished(Child(script, (SAMPLES / "card_pictures.py").read_text(), *words, folder=tmp_path))
+    finished(Child(script, SAMPLES / "card_pictures.py", *words, folder=tmp_path))
     pictures = [Image.open(file) for file in (tmp_path / "drawn.jpg", weights.CARDS / f"{name}.jpg")]
     drawn, shown = (np.asarray(picture, dtype=float) for picture in pictures)
     assert np.abs(drawn - shown).mean() < 1

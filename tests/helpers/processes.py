@@ -133,10 +133,11 @@ def command(*words: str) -> None:
     main()
 
 
-def script(code: str, *words: str) -> None:
-    """Code as a program with arguments."""
-    sys.argv = ["script", *words]
-    exec(compile(code, "script", "exec"), {"__name__": "__main__"})  # noqa: S102
+def script(code: str | Path, *words: str) -> None:
+    """Code, or a file of it, as a program with arguments."""
+    name, text = (str(code), code.read_text()) if isinstance(code, Path) else ("script", code)
+    sys.argv = [name, *words]
+    exec(compile(text, name, "exec"), {"__name__": "__main__", "__file__": name})  # noqa: S102
 
 
 def save_numbered(folder: str, number: int) -> None:
