@@ -73,7 +73,9 @@ def test_the_readme_becomes_one_without_files_beside_it():
     text, url = (CHECKOUT / "README.md").read_text(), "https://host.example/owner/unitouch_gen"
     absolute = [target for target in targets(text) if re.match("https?://", target)]
     expected = [
-        target if target in absolute else f"{url}/{'raw' if target.endswith('.png') else 'blob'}/HEAD/{target}"
+        target
+        if target in absolute
+        else f"{url}/{'raw' if target.endswith(('.png', '.jpg')) else 'blob'}/HEAD/{target}"
         for target in targets(text)
     ]
     assert targets(described(text, url)) == expected and targets(described(text, "")) == absolute

@@ -78,6 +78,19 @@ ELSEWHERE = ("touch: material", "touch to picture: material", "photo to touch: m
 """What it shows of drawn sensors and beyond the ranges of training."""
 
 
+def elsewhere(quality: Figures) -> list[str]:
+    """A line each on sensors drawn anew, and on what lies beyond the ranges of training."""
+    lines = []
+    for part, words in {"drawn": "By sensors drawn anew", "beyond": "Beyond the ranges of training"}.items():
+        found = [(name, quality[part][name]) for name in ELSEWHERE if name in quality[part]]
+        told = [
+            f"{SUMMARY[name].replace('*', '')} {_shown(name, row['value'])} (shuffled {_shown(name, row['shuffled'])})"
+            for name, row in found
+        ]
+        lines.append(f"{words}: {'; '.join(told)}.")
+    return lines
+
+
 def summary_table(figures: Figures) -> str:
     """Figures of a GelSight's touches beside their controls, and a line each on what is harder."""
     quality = figures["quality"]
@@ -85,14 +98,7 @@ def summary_table(figures: Figures) -> str:
     for name, words in SUMMARY.items():
         row = quality["rows"][name]
         rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
-    lines = []
-    for part, words in {"drawn": "By sensors drawn anew", "beyond": "Beyond the ranges of training"}.items():
-        found = [(name, quality[part][name]) for name in ELSEWHERE if name in quality[part]]
-        told = (
-            f"{SUMMARY[n].replace('*', '')} {_shown(n, r['value'])} (shuffled {_shown(n, r['shuffled'])})"
-            for n, r in found
-        )
-        lines.append(f"{words}: {'; '.join(told)}.")
+    lines = elsewhere(quality)
     real = quality["real"]["recordings"]
     lines.append(
         "On a real GelSight, hardness, roughness and bumps of objects it has not seen are read linearly off its "
@@ -111,7 +117,8 @@ def main_table(figures: Figures) -> str:
         f"material is {percent(1 / len(MATERIAL_NAMES))}. One picture takes "
         f"{figures['speed']['seconds_per_picture']:.2f} s after loading ({figures['speed']['machine']})."
     )
-    return f"{quality_table(figures, 'touch: ', 'image: ', 'audio: ', 'text: ', 'touch to ', 'touch, read')}\n\n{note}"
+    rows = quality_table(figures, "touch: ", "image: ", "audio: ", "text: ", "touch to ", "touch, read")
+    return "\n\n".join([rows, *elsewhere(figures["quality"]), note])
 
 
 REAL_ROWS = {
