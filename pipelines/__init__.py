@@ -1,9 +1,13 @@
 """Generative pipelines between touch and image."""
 
 from unitouch_gen.pipelines import _pillow  # noqa: F401 - before anything that imports diffusers' pipelines
-from unitouch_gen.pipelines.output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.output import TouchToTextPipelineOutput, UniTouchPipelineOutput
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
+from unitouch_gen.pipelines.touch_to_text import TouchToTextPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
-__all__ = ["TactileStylizationPipeline", "TouchToImagePipeline", "UniTouchPipelineOutput", "XToTouchPipeline"]
+__all__ = [
+    "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline", "TouchToTextPipelineOutput",
+    "UniTouchPipelineOutput", "XToTouchPipeline",
+]  # fmt: skip

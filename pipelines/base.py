@@ -64,12 +64,12 @@ SMALL_NETWORK = 20_000_000
 
 
 def runs_networks(method: Method) -> Method:
-    """A method of a pipeline that runs its networks: without gradients, and in one thread if its UNet is small."""
+    """A method of a pipeline that runs networks: without gradients, and in one thread if its main network is small."""
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
         threads = torch.get_num_threads()
-        small = sum(parameter.numel() for parameter in self.unet.parameters()) < SMALL_NETWORK
+        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < SMALL_NETWORK
         torch.set_num_threads(1 if small else threads)
         try:
             with torch.no_grad():
@@ -120,7 +120,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     """
 
     _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
-    _example_call = ""  # shown on the model card
+    _main_network = "unet"
+    _example_call, _example_end = "", 'output.images[0].save("output.png")'  # shown on the model card
+    _task = "image-to-image"  # and its tag
     text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
     _card: Card | Path | None = None  # or the folder with the card
 
@@ -129,6 +131,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
+        self._check_widths(network)
+
+    def _check_widths(self, network: str) -> None:
+        """Raises if the embeddings of a part have another width than a network takes."""
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
             "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
@@ -400,7 +406,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         )  # diffusers' download cannot resolve our components
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
-            for part in ("unet", "vae", "embedding_bank", "backgrounds", "text_encoder", "image_normalizer"):
+            parts = ("unet", "vae", "embedding_bank", "backgrounds", "text_encoder", "image_normalizer", "language_bridge")
+            for part in parts:
                 if part not in kwargs:
                     check_filled(folder / part, getattr(pipe, part, None))
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))

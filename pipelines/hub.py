@@ -16,11 +16,14 @@ from huggingface_hub import ModelCard, ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
-__all__ = ["EmbeddingBank", "SensorBackgrounds", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor"]
+__all__ = [
+    "EmbeddingBank", "LanguageBridge", "SensorBackgrounds", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor",
+]  # fmt: skip
 
-PARTS = {kind.__name__: kind for kind in (EmbeddingBank, SensorBackgrounds, UniTouchModel, UniTouchProcessor)}
+_KINDS = (EmbeddingBank, LanguageBridge, SensorBackgrounds, UniTouchModel, UniTouchProcessor)
+PARTS = {kind.__name__: kind for kind in _KINDS}
 MODULE = "pipeline"  # diffusers' name for such files
 CODE = '''"""The classes of this folder are in the package `unitouch_gen`, which has to be installed."""
 
@@ -95,7 +98,7 @@ class Card:
             data=ModelCardData(
                 license=self.license.lower() or None,
                 library_name="diffusers",
-                pipeline_tag="image-to-image",
+                pipeline_tag=pipe._task,
                 tags=["unitouch_gen", "touch", "tactile"],
             ).to_yaml(),
             title=Path(name).name,
@@ -104,6 +107,7 @@ class Card:
             kind=type(pipe).__name__,
             name=name,
             call=pipe._example_call,
+            end=pipe._example_end,
             figures=f"| figure | measured |\n|---|---|\n{figures}" if figures else "Not stated.",
             trained_on=self.data or "Not stated.",
             limits=self.limits,
@@ -127,7 +131,7 @@ from unitouch_gen import {kind}, example  # pip install unitouch_gen
 
 pipe = {kind}.from_pretrained("{name}")
 output = {call}  # or paths of your own
-output.images[0].save("output.png")
+{end}
 print(output.report)
 ```
 

@@ -1,6 +1,6 @@
 """What the pipelines return."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -24,5 +24,34 @@ class UniTouchPipelineOutput(BaseOutput):
 
     images: list[Image.Image] | np.ndarray | torch.Tensor
     report: RunReport
+    embeds: torch.Tensor
+    encoded: torch.Tensor | None = None
+
+
+@dataclass
+class AnswerReport(RunReport):
+    """What a call of `TouchToTextPipeline` did."""
+
+    prompt_tokens: list[int] = field(default_factory=list)  #: of each question, as it was put
+    tokens: list[int] = field(default_factory=list)  #: of each answer, without its end
+
+    def __str__(self) -> str:
+        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
+        return f"{sum(self.tokens)} tokens, {sum(self.seconds.values()):.2f} s ({stages})"
+
+
+@dataclass
+class TouchToTextPipelineOutput(BaseOutput):
+    """Output of `TouchToTextPipeline`.
+
+    Args:
+        texts: Answers, those of one input together.
+        report: What the call did.
+        embeds: Embeddings (B, D) that the answers are about; pass them to another call to skip encoding.
+        encoded: Touch embeddings (B, D) before mix and bridge. `None` without touches.
+    """
+
+    texts: list[str]
+    report: AnswerReport
     embeds: torch.Tensor
     encoded: torch.Tensor | None = None

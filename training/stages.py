@@ -46,6 +46,12 @@ STAGES: dict[str, dict[str, str]] = {
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
+OPTIONAL_STAGES: dict[str, dict[str, str]] = {
+    "language_model": {},
+    "touch_llm": {"joint": "image_text", "llama": "language_model"},
+}
+"""Stages of models that a family has not yet."""
+
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
@@ -77,6 +83,7 @@ class Stage:
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
         joint: Annotated[Path | None, Option(exists=True, help="Folder of the joint space to build on.")] = None,
         vae: Annotated[Path | None, Option(exists=True, help="Folder of the autoencoder to build on.")] = None,
+        llama: Annotated[Path | None, Option(exists=True, help="Folder of the language model to build on.")] = None,
         init: Annotated[Path | None, Option(exists=True, help="Folder of weights to start from.")] = None,
     ):
         on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
@@ -93,9 +100,9 @@ class Stage:
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)
         self.trainer, self.data = self.recipe.trainer, self.recipe.data
-        folders = {"joint": joint, "vae": vae, "init": init}
+        folders = {"joint": joint, "vae": vae, "llama": llama, "init": init}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        needs = {*STAGES[name]}
+        needs = {*(STAGES | OPTIONAL_STAGES)[name]}
         if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
             wanted = command_of(name, Path("runs"))
@@ -206,7 +213,7 @@ class Stage:
 
 def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in (STAGES | OPTIONAL_STAGES)[name].items()]
     return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
         TouchToImagePipeline,
+        TouchToTextPipeline,
         UniTouchPipelineOutput,
         XToTouchPipeline,
     )
@@ -41,6 +42,7 @@ _HOMES = {
     "NonFiniteError": "errors",
     "TactileStylizationPipeline": "pipelines",
     "TouchToImagePipeline": "pipelines",
+    "TouchToTextPipeline": "pipelines",
     "UniTouchPipelineOutput": "pipelines",
     "XToTouchPipeline": "pipelines",
     "example": "examples",
@@ -55,6 +57,7 @@ __all__ = [
     "StemmedCLIPVisionModel",
     "TactileStylizationPipeline",
     "TouchToImagePipeline",
+    "TouchToTextPipeline",
     "UniTouchConfig",
     "UniTouchModel",
     "UniTouchPipelineOutput",

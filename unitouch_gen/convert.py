@@ -236,9 +236,9 @@ LEFT_BY_TRAINERS: list[Any] = [
 def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     """The weights in a checkpoint, which came in an argument of some name.
 
-    It is a pickle of `torch.save`, with or without Lightning's wrapping, or safetensors. A pickle is read by torch's
-    unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the format since torch 1.6
-    stay in the file until they are used.
+    It is a pickle of `torch.save`, also of a dict with the weights as "state_dict" or "model", or safetensors. A pickle
+    is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the format
+    since torch 1.6 stay in the file until they are used.
 
     Raises:
         InvalidInputError: If there is no such file, it is cut off, or holds anything but tensors and plain containers.
@@ -258,7 +258,7 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
         else:
             why = f"cannot be read as a checkpoint ({first_line(error)}): it is cut off, or something else"
         raise InvalidInputError(f"{subject} {why}.") from error
-    found = found.get("state_dict", found) if isinstance(found, Mapping) else {}
+    found = found.get("state_dict", found.get("model", found)) if isinstance(found, Mapping) else {}
     tensors = {key: value for key, value in found.items() if isinstance(value, Tensor) and value.is_floating_point()}
     tensors = {key: value for key, value in tensors.items() if value.layout == torch.strided and not value.is_meta}
     if not tensors:

@@ -1,4 +1,4 @@
-"""`unitouch-gen convert unitouch`: published checkpoints as folders of safetensors."""
+"""`unitouch-gen convert unitouch` and `touch-llm`: published checkpoints as folders of safetensors."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,3 +35,24 @@ def unitouch(
     )
     echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     echo(f"The model is in {output.resolve()}")
+
+
+@app.command()
+def touch_llm(
+    bridge: Annotated[Path, Option(**FILE, help="Touch-LLM's checkpoint.")],
+    llama: Annotated[Path, Option(exists=True, file_okay=False, help="Folder of the LLaMA it was trained on.")],
+    output: Annotated[Path, Option("--output", "-o", help="A folder for the pipeline.")],
+    unitouch: Annotated[Path | None, Option(exists=True, help="Folder that `convert unitouch` wrote.")] = None,
+    dtype: Annotated[str, Option(help="float32, float16 or bfloat16.")] = "float16",
+) -> None:
+    """Converts Touch-LLM's checkpoint: its bridge, and the LLaMA with what was fine-tuned of it.
+
+    Example: unitouch-gen convert touch-llm --bridge checkpoint.pth --llama llama-7b --unitouch unitouch -o touch-llm
+    """
+    from unitouch_gen.errors import check_dtype
+    from unitouch_gen.pipelines import TouchToTextPipeline
+
+    kind = check_dtype("--dtype", dtype)
+    TouchToTextPipeline.from_published(bridge, llama, unitouch, dtype=kind).save_pretrained(output)
+    echo("Licence: CC-BY-NC-4.0, as UniTouch's, and LLaMA's own; not for commercial use")
+    echo(f"The pipeline is in {output.resolve()}")

@@ -24,6 +24,9 @@ CLASSES = {
 }
 """Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
 
+ANSWERING = {"touch-to-text": "TouchToTextPipeline"}
+"""The same of one that draws nothing, and is not built in."""
+
 INPUTS = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
 """What pipelines are given of a contact to be measured on."""
 
@@ -84,7 +87,7 @@ def load_pipeline(
     name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu",
     load_sensor: Sequence[Path] | None = None, quiet: bool = True, **_others: Any,
 ) -> Any:  # fmt: skip
-    """A pipeline, one of `CLASSES`, by the options of a command: saved in a folder or repository, or built in."""
+    """A pipeline, one of `CLASSES` or `ANSWERING`, by a command's options: of a folder or repository, or built in."""
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
     import torch
@@ -107,7 +110,7 @@ def load_pipeline(
     else:
         folder = folder_of(model)
         with reading("--model", model):
-            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=weights_dtype)
+            pipe = getattr(pipelines, (CLASSES | ANSWERING)[name]).from_pretrained(folder, dtype=weights_dtype)
     for file in load_sensor or ():
         pipe.load_sensor(file)
     pipe.set_progress_bar_config(disable=quiet)

@@ -7,6 +7,7 @@ from transformers import AutoConfig, AutoModel, AutoProcessor
 
 from unitouch_gen.models.config import UniTouchConfig, UniTouchViTConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
+from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT
@@ -17,6 +18,6 @@ AutoModel.register(UniTouchConfig, UniTouchModel, exist_ok=True)
 AutoProcessor.register(UniTouchConfig, UniTouchProcessor, exist_ok=True)
 
 __all__ = [
-    "MODALITIES", "SensorBank", "SensorMatch", "StemmedCLIPVisionModel", "UniTouchConfig", "UniTouchModel",
-    "UniTouchProcessor", "UniTouchViT", "UniTouchViTConfig",
+    "MODALITIES", "LanguageBridge", "SensorBank", "SensorMatch", "StemmedCLIPVisionModel", "UniTouchConfig",
+    "UniTouchModel", "UniTouchProcessor", "UniTouchViT", "UniTouchViTConfig",
 ]  # fmt: skip

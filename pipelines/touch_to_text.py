@@ -1,0 +1,224 @@
+"""`TouchToTextPipeline`: answers about a touch by a language model, Touch-LLM (Section 4.6 of the paper)."""
+
+import copy
+import inspect
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import takewhile
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
+from unitouch_gen.conditioning import EmbeddingBank, mix_to_norm
+from unitouch_gen.convert_llm import read_touch_llm
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_integer,
+    check_kind,
+    check_tensor,
+    check_texts,
+    did_you_mean,
+    first_line,
+)  # fmt: skip
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.language import LanguageBridge
+from unitouch_gen.models.processing import UniTouchProcessor
+from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, check_unused, check_weights, runs_networks
+from unitouch_gen.pipelines.output import AnswerReport, TouchToTextPipelineOutput
+from unitouch_gen.pipelines.published import read_joint
+
+QUESTION = "{question}"  # where a template has it
+
+_ANSWERING = threading.Lock()  # `generate` draws from torch's global generator, and hooks are seen by all threads
+
+
+class TouchToTextPipeline(UniTouchPipeline):
+    """Touch to text: a language model that answers questions about a touch.
+
+    Args:
+        language_bridge: Puts an embedding into the language model; see `LanguageBridge`.
+        language_model: Any causal language model of transformers whose attention ends in `o_proj`.
+        tokenizer: The language model's; its chat template is used if it has one.
+        unitouch, processor: The joint space and its processor. May be `None` if embeddings are passed.
+        embedding_bank: Image embeddings that touches are moved to; `None` for no such bridge.
+        prompt_template: What the language model was trained to be asked by, with "{question}" in it.
+    """
+
+    model_cpu_offload_seq = "unitouch->language_model"
+    _optional_components = ["unitouch", "processor", "embedding_bank"]
+    _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "language_bridge"]
+    _main_network, _task = "language_model", "image-to-text"
+    _example_call, _example_end = 'pipe(example("brick"), "How does it feel?")', "print(output.texts[0])"
+
+    def __init__(
+        self, language_bridge: LanguageBridge, language_model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase,
+        unitouch: UniTouchModel | None = None, processor: UniTouchProcessor | None = None,
+        embedding_bank: EmbeddingBank | None = None, prompt_template: str = QUESTION,
+    ):  # fmt: skip
+        super().__init__()
+        self.register_modules(
+            language_bridge=language_bridge, language_model=language_model, tokenizer=tokenizer, unitouch=unitouch,
+            processor=processor, embedding_bank=embedding_bank,
+        )  # fmt: skip
+        if QUESTION not in check_kind("prompt_template", prompt_template, str):
+            raise InvalidInputError(f"`prompt_template` is {prompt_template!r}; it has to hold '{QUESTION}'.")
+        self.register_to_config(prompt_template=prompt_template)
+        language_bridge.check_fits(language_model)
+        self._check_widths("`language_bridge`")
+
+    @property
+    def embedding_dim(self) -> int:
+        """D, width of the embeddings that the language bridge takes."""
+        return self.language_bridge.config["embedding_dim"]
+
+    @runs_networks
+    def __call__(
+        self,
+        touch: ImageInput = None, question: str | list[str] | None = None, max_new_tokens: int | None = None,
+        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
+        weights: Sequence[float] | None = None, image: ImageInput = None, touch_embeds: Tensor | None = None,
+        generator: torch.Generator | None = None, return_dict: bool = True, **generate: Any,
+    ) -> TouchToTextPipelineOutput | tuple:  # fmt: skip
+        """Answers questions about touches. Other arguments, errors and warnings: see `TouchToImagePipeline.__call__`.
+
+        Args:
+            question: One question, or one for each touch; or several about a single touch.
+            max_new_tokens: Most tokens of an answer; default the language model's own, or 128.
+            weights: Of several touches that are one input: answers are about their mix. Only ratios count.
+            image: Photos in place of `touch`.
+            generator: Seeds what is drawn, and torch's global generator stays as it was; without one, that draws.
+            return_dict: Whether to return an output object rather than the tuple (texts, report).
+            generate: Options of the language model's `generate`, such as `do_sample`, `temperature`, `num_beams`,
+                `num_return_sequences`, `streamer` or `stopping_criteria`.
+
+        Examples:
+            >>> pipe = TouchToTextPipeline.from_pretrained("path/to/touch-llm")  # doctest: +SKIP
+            >>> pipe("touch.png", "How does it feel?").texts  # doctest: +SKIP
+        """
+        # 1. Check inputs, before any network runs
+        given = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
+        name, *others = [name for name, value in given.items() if value is not None] or [""]
+        if others or not name:
+            raise InvalidInputError("`touch`, `image` or `touch_embeds` has to be passed, one of them.")
+        if name == "touch":
+            bridge, inputs = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
+        else:
+            check_unused(name, sensor=sensor, background=background, bridge=bridge or None)
+            inputs = touch_embeds if name == "touch_embeds" else self._joint(name) and self.processor.images(image)
+        if name == "touch_embeds":
+            check_tensor(name, inputs, "B", self.embedding_dim)
+        count = len(inputs.pixels if name == "touch" else inputs)
+        if weights is not None:
+            weights = check_weights("weights", check_kind("weights", weights, list, tuple))
+            if len(weights) != count:
+                raise InvalidInputError(f"`weights` holds {len(weights)} for {count} inputs; pass one for each.")
+            count = 1
+        if generator is not None:
+            check_kind("generator", generator, torch.Generator)
+        prompts = self._tokenize(question, count)
+        config, options = self._check_options(prompts, max_new_tokens, generate)
+
+        # 2. Encode the touch
+        report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
+        with report.stage(name):
+            encoded, embeds = self._encode(name, inputs, weights, bool(bridge), report)
+
+        # 3. Generate token ids, after prompts that are padded on the left
+        device, pad, width = self._execution_device, config.pad_token_id, max(report.prompt_tokens)
+        ids = torch.tensor([[pad] * (width - len(prompt)) + prompt for prompt in prompts], device=device)
+        mask = torch.tensor([[0] * (width - size) + [1] * size for size in report.prompt_tokens], device=device)
+        rows = embeds.expand(len(prompts), -1).to(device)
+        model, attach = self.language_model, self.language_bridge.attach
+        with report.stage("answer"), _ANSWERING, seeded(generator, device), attach(model, rows):
+            made = model.generate(ids, attention_mask=mask, generation_config=config, **options)
+
+        # 4. Decode them
+        answers = getattr(made, "sequences", made)[:, width:]
+        texts = [text.strip() for text in self.tokenizer.batch_decode(answers, skip_special_tokens=True)]
+        ends = {pad, *config.eos_token_id}
+        report.tokens = [sum(1 for _ in takewhile(lambda one: one not in ends, row)) for row in answers.tolist()]
+        self.maybe_free_model_hooks()
+        return TouchToTextPipelineOutput(texts, report, embeds, encoded) if return_dict else (texts, report)
+
+    @runs_networks
+    def encode_touch(
+        self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None
+    ) -> Tensor:
+        """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
+        bridge, touches = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
+        return self._encode("touch", touches, None, bridge, AnswerReport())[1]
+
+    def _encode(
+        self, name: str, inputs: Any, weights: Sequence[float] | None, bridge: bool, report: AnswerReport
+    ) -> tuple[Tensor | None, Tensor]:
+        """Embeddings (B, D): of touches as encoded, and of any inputs with mix and bridge."""
+        encoded = self._touch_embeds(inputs, report) if name == "touch" else None
+        if name == "image":
+            inputs = self._match_norm(self.unitouch.get_image_features(inputs), name)
+        embeds = inputs if encoded is None else encoded
+        if weights is not None:
+            embeds = mix_to_norm(embeds[:, None], torch.tensor(weights))
+        return encoded, self.embedding_bank.bridge(embeds) if bridge else embeds
+
+    def _tokenize(self, question: Any, count: int) -> list[list[int]]:
+        """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
+        questions = check_texts("question", question)
+        if not all(text.strip() for text in questions):
+            raise InvalidInputError("`question` is blank; ask something.")
+        if len(questions) not in (1, count) and count > 1:
+            raise InvalidInputError(f"`question` holds {len(questions)} for {count} inputs; pass one, or one for each.")
+        texts = [self.config["prompt_template"].replace(QUESTION, text) for text in questions]
+        chat = getattr(self.tokenizer, "chat_template", None) is not None  # which writes the special tokens itself
+        if chat:
+            turns = [[{"role": "user", "content": text}] for text in texts]
+            texts = self.tokenizer.apply_chat_template(turns, tokenize=False, add_generation_prompt=True)
+        prompts = self.tokenizer(texts, add_special_tokens=not chat)["input_ids"]
+        return prompts * count if len(prompts) == 1 else prompts
+
+    def _check_options(self, prompts: list[list[int]], most: int | None, given: dict[str, Any]) -> tuple[Any, dict]:
+        """The configuration of `generate`, with at most `most` new tokens, and its other options."""
+        longest, model, tokenizer = max(map(len, prompts)), self.language_model, self.tokenizer
+        free = (getattr(model.config.get_text_config(), "max_position_embeddings", None) or 10**9) - longest
+        if free < 1:
+            raise InvalidInputError(f"`question` has {longest} tokens, too many for the language model; shorten it.")
+        config = copy.deepcopy(model.generation_config)
+        most = min(config.max_new_tokens or 128, free) if most is None else most
+        config.max_new_tokens = check_integer("max_new_tokens", most, 1, free)
+        known = {*vars(config), *inspect.signature(model.generate).parameters}
+        known -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are ours to say
+        for name in given.keys() - known:
+            raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
+        if given.get("streamer") is not None and len(prompts) > 1:
+            raise InvalidInputError(f"`streamer` is for one answer, not for {len(prompts)}; leave it out.")
+        try:
+            others = config.update(**given)
+        except (ValueError, TypeError) as error:
+            raise InvalidInputError(f"`generate` cannot use its options: {first_line(error)}") from error
+        ends = tokenizer.eos_token_id if config.eos_token_id is None else config.eos_token_id
+        config.eos_token_id = ends if isinstance(ends, list) else [ends]
+        pads = (config.pad_token_id, tokenizer.pad_token_id, config.eos_token_id[0])
+        config.pad_token_id = next(one for one in pads if one is not None)
+        return config, others
+
+    @classmethod
+    def from_published(
+        cls, bridge: str | os.PathLike, llama: str | os.PathLike, unitouch: str | os.PathLike | None = None,
+        *, dtype: torch.dtype = torch.float32,
+    ) -> Self:  # fmt: skip
+        """Builds on Touch-LLM's published `bridge` and a `llama`, see `read_touch_llm`, and a converted joint space."""
+        joint = {} if unitouch is None else dict(zip(("unitouch", "processor"), read_joint(unitouch, dtype, {})))
+        return cls(**read_touch_llm(bridge, llama, dtype=dtype), **joint)
+
+
+@contextmanager
+def seeded(generator: torch.Generator | None, device: torch.device) -> Iterator[None]:
+    """Seeds torch's global generators by a draw from one, and puts them back."""
+    with torch.random.fork_rng([device] if device.type == "cuda" else [], enabled=generator is not None):
+        if generator is not None:
+            torch.manual_seed(int(torch.randint(2**62, (1,), generator=generator, device=generator.device)))
+        yield

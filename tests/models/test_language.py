@@ -1,0 +1,162 @@
+"""The language bridge: its equation, every way to generate, and a language model that stays as it was."""
+
+import threading
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.testing import assert_close
+from transformers import (
+    AutoModelForCausalLM,
+    Gemma2Config,
+    GPT2Config,
+    LlamaConfig,
+    LlamaForCausalLM,
+    MixtralConfig,
+    Phi3Config,
+    Qwen2Config,
+    Qwen3Config,
+    TextIteratorStreamer,
+)  # fmt: skip
+
+from tests.helpers.components import D
+from tests.helpers.language import SIZES, make_language_parts
+from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.models.language import LanguageBridge
+
+IDS = torch.randint(3, 250, (3, 6), generator=torch.Generator().manual_seed(0))
+EMBEDS = torch.randn(3, D, generator=torch.Generator().manual_seed(1))
+TOKENS = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2, "vocab_size": 280}
+MODES = {
+    "greedy": {"do_sample": False}, "sampling": {"do_sample": True, "temperature": 0.7, "top_p": 0.9},
+    "beams": {"num_beams": 3, "num_return_sequences": 2}, "beam sampling": {"num_beams": 2, "do_sample": True},
+    "several": {"do_sample": True, "num_return_sequences": 3}, "no cache": {"use_cache": False},
+    "static cache": {"cache_implementation": "static"}, "guidance": {"guidance_scale": 2.0},
+}  # fmt: skip
+
+
+@pytest.fixture
+def parts():
+    made = make_language_parts()
+    return made["language_bridge"], made["language_model"]
+
+
+def generate(model, rows=slice(None), **options):
+    torch.manual_seed(0)
+    mask = torch.ones_like(IDS[rows])
+    return model.generate(IDS[rows], attention_mask=mask, max_new_tokens=6, min_new_tokens=6, **options)
+
+
+@torch.no_grad()
+def test_what_is_added_is_the_gated_value_of_an_adapter_token(parts):
+    """By an adapter key and value in the attention itself, whose softmax over one token is 1."""
+    bridge, model = parts
+    seen = {}
+    attention = model.model.layers[0].self_attn
+    attention.o_proj.register_forward_hook(lambda module, inputs, output: seen.update(states=inputs[0]))
+    model(IDS)
+    before = seen["states"]
+    with bridge.attach(model, EMBEDS):
+        model(IDS)
+    x = bridge.projection(EMBEDS / EMBEDS.norm(dim=1, keepdim=True))
+    for block in bridge.blocks:
+        n = block.norm.weight * x / (x.square().mean(dim=1, keepdim=True) + 1e-6).sqrt()
+        x = x + block.w2(F.silu(block.w1(n)) * block.w3(n))
+    value = (attention.v_proj.weight @ (x + bridge.queries[0]).T).T.view(3, 4, 8)
+    added = torch.tanh(bridge.gates[0])[:, None] * value
+    assert_close(seen["states"] - before, added.flatten(1)[:, None].expand(-1, 6, -1), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("mode", MODES)
+@torch.no_grad()
+def test_closed_gates_and_detaching_leave_every_bit_and_open_gates_do_not(parts, mode, dtype):
+    bridge, model = (part.to(dtype) for part in parts)
+    before, logits = generate(model, **MODES[mode]), model(IDS).logits
+    with bridge.attach(model, EMBEDS):
+        assert not torch.equal(model(IDS).logits, logits)
+        open_ = generate(model, **MODES[mode])
+    bridge.gates.zero_()
+    attached = bridge.attach(model, EMBEDS)
+    assert torch.equal(generate(model, **MODES[mode]), before) and torch.equal(model(IDS).logits, logits)
+    attached.detach()
+    assert torch.equal(model(IDS).logits, logits) and not torch.equal(open_, before)
+    assert not any(module._forward_pre_hooks for module in model.modules())
+
+
+@pytest.mark.parametrize("mode", ["greedy", "beams", "no cache", "static cache"])
+@torch.no_grad()
+def test_inputs_of_a_batch_get_what_each_gets_alone(parts, mode):
+    bridge, model = parts
+    with bridge.attach(model, EMBEDS):
+        together = generate(model, **MODES[mode])
+    for row in range(3):
+        with bridge.attach(model, EMBEDS[row : row + 1]):
+            alone = generate(model, slice(row, row + 1), **MODES[mode])
+        assert torch.equal(alone, together[row * len(alone) : (row + 1) * len(alone)])
+
+
+def test_words_are_streamed_as_they_are_generated():
+    made = make_language_parts()
+    bridge, model, tokenizer = made["language_bridge"], made["language_model"], made["tokenizer"]
+    with bridge.attach(model, EMBEDS[:1]), torch.no_grad():
+        whole = tokenizer.decode(generate(model, slice(1))[0, 6:])
+        streamer = TextIteratorStreamer(tokenizer, skip_prompt=True, timeout=60)
+        thread = threading.Thread(target=generate, args=(model, slice(1)), kwargs={"streamer": streamer})
+        thread.start()
+        pieces = list(streamer)
+        thread.join()
+    assert "".join(pieces) == whole
+
+
+@pytest.mark.parametrize(
+    ("kind", "sizes"),
+    [
+        (LlamaConfig, {"num_key_value_heads": 2, "head_dim": 12}), (Qwen2Config, {"num_key_value_heads": 2}),
+        (Qwen3Config, {"num_key_value_heads": 1, "head_dim": 8}), (Phi3Config, {"num_key_value_heads": 2}),
+        (Gemma2Config, {"num_key_value_heads": 2, "head_dim": 8}), (MixtralConfig, {"num_key_value_heads": 2}),
+    ],
+)  # fmt: skip
+@torch.no_grad()
+def test_any_attention_that_ends_in_o_proj_takes_a_bridge(kind, sizes):
+    torch.manual_seed(0)
+    model = AutoModelForCausalLM.from_config(kind(**{**SIZES, **TOKENS, **sizes})).eval()
+    bridge = LanguageBridge.for_model(model, D, intermediate_size=24).eval()
+    before = model(IDS).logits
+    with bridge.attach(model, EMBEDS):
+        assert torch.equal(model(IDS).logits, before)
+    torch.nn.init.ones_(bridge.gates)
+    with bridge.attach(model, EMBEDS):
+        assert (model(IDS).logits - before).abs().max() > 1e-4
+
+
+def test_gradients_reach_the_bridge_alone_also_through_checkpointed_blocks(parts):
+    bridge, model = parts
+    model.requires_grad_(False)
+    grads = []
+    for checkpointed in (False, True):
+        if checkpointed:
+            model.activation_checkpointing_enable()
+            model.train()
+        bridge.zero_grad()
+        with bridge.attach(model, EMBEDS):
+            model(input_ids=IDS, labels=IDS, use_cache=False).loss.backward()
+        grads.append([parameter.grad.clone() for parameter in bridge.parameters()])
+        assert all(bool(grad.any()) for grad in grads[-1])
+    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*grads, strict=True))
+    assert all(parameter.grad is None for parameter in model.parameters())
+
+
+def test_a_language_model_that_does_not_fit_and_adapters_out_of_range_are_refused(parts):
+    bridge, model = parts
+    for change, words in (
+        ({"num_hidden_layers": 3}, "`num_layers` 2, but the language model 3"),
+        ({"hidden_size": 64, "head_dim": 8}, "`hidden_size` 32"), ({"num_attention_heads": 2}, "`num_heads` 4"),
+    ):  # fmt: skip
+        other = LlamaForCausalLM(LlamaConfig(**{**SIZES, **TOKENS, **change}))
+        with pytest.raises(InvalidInputError, match=words):
+            bridge.attach(other, EMBEDS)
+    with pytest.raises(InvalidInputError, match="GPT2LMHeadModel, whose attention has no `o_proj`"):
+        LanguageBridge.for_model(AutoModelForCausalLM.from_config(GPT2Config(n_layer=1, n_embd=32, n_head=4)), D)
+    with pytest.raises(NonFiniteError, match="float32 or bfloat16"):
+        bridge.attach(model, torch.full((1, D), torch.nan))

@@ -1,0 +1,172 @@
+"""`LanguageBridge`: an embedding of the joint space, put into every attention of a language model (Section 4.6).
+
+The paper's T_j^q = h_zero F' + T_j^q as its release computes it, after ImageBind-LLM (Han et al., 2023, "ImageBind-LLM:
+Multi-modality Instruction Tuning"): one adapter token in each layer needs no softmax, so its value is added, through a
+gate of each head, to what the attention gives to every token.
+"""
+
+from contextlib import ExitStack
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F
+from diffusers import ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
+from torch import Tensor, nn
+from transformers import PreTrainedModel
+
+from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.files import saved_whole
+
+
+class SwiGLU(nn.Module):
+    """A residual block: x + W2 (silu(W1 n(x)) * W3 n(x)), n an RMSNorm; `legacy`: a LayerNorm, and biases."""
+
+    def __init__(self, width: int, hidden: int, legacy: bool):
+        super().__init__()
+        self.norm = nn.LayerNorm(width) if legacy else nn.RMSNorm(width, eps=1e-6)
+        self.w1 = nn.Linear(width, hidden, bias=legacy)
+        self.w2 = nn.Linear(hidden, width, bias=legacy)
+        self.w3 = nn.Linear(width, hidden, bias=legacy)
+
+    def forward(self, x: Tensor) -> Tensor:
+        normed = self.norm(x)
+        return x + self.w2(F.silu(self.w1(normed)) * self.w3(normed))
+
+
+class Attachment(ExitStack):
+    """The hooks of a bridge in a language model; `detach()`, or the end of a `with` block, removes them."""
+
+    detach = ExitStack.close
+
+
+class LanguageBridge(ModelMixin, ConfigMixin):
+    """Projection, residual blocks, a query of each layer, and a zero-initialised gate of each head.
+
+    F' = blocks(W e / |e| + b); a_l = F' + q_l; before `o_proj` of layer l, head h of every token gets
+    tanh(g_lh) (W_v a_l)_h, with W_v the layer's own values. At gates of zero nothing is changed.
+
+    Args:
+        embedding_dim: D, width of the embeddings e.
+        hidden_size: C, width of the language model.
+        num_layers: L, its attentions.
+        num_heads: H, its query heads.
+        num_blocks: Residual blocks.
+        intermediate_size: Their width inside; default 4 C.
+        legacy: Blocks with LayerNorm and biases.
+        value_rank: r of a low-rank pair that is in W_v, and is not used for a_l: the release fine-tunes W_v for words
+            alone.
+
+    Example:
+        >>> bridge = LanguageBridge.for_model(language_model, embedding_dim=1024)  # doctest: +SKIP
+        >>> with bridge.attach(language_model, embeds):  # doctest: +SKIP
+        ...     language_model.generate(**inputs)
+    """
+
+    save_pretrained = saved_whole(ModelMixin.save_pretrained)
+
+    @register_to_config
+    def __init__(
+        self, embedding_dim: int, hidden_size: int, num_layers: int, num_heads: int, num_blocks: int = 3,
+        intermediate_size: int | None = None, legacy: bool = False, value_rank: int = 0,
+    ):  # fmt: skip
+        super().__init__()
+        hidden = intermediate_size or 4 * hidden_size
+        self.projection = nn.Linear(embedding_dim, hidden_size)
+        self.blocks = nn.Sequential(*(SwiGLU(hidden_size, hidden, legacy) for _ in range(num_blocks)))
+        self.queries = nn.Parameter(torch.randn(num_layers, hidden_size))
+        self.gates = nn.Parameter(torch.zeros(num_layers, num_heads))
+        self.value_down = self.value_up = None
+        if value_rank:
+            self.value_down = nn.Parameter(torch.zeros(num_layers, value_rank, hidden_size))
+            self.value_up = nn.Parameter(torch.zeros(num_layers, hidden_size, value_rank))
+
+    @classmethod
+    def for_model(
+        cls, language_model: PreTrainedModel, embedding_dim: int, num_blocks: int = 3,
+        intermediate_size: int | None = None,
+    ) -> Self:  # fmt: skip
+        """A new bridge into a language model."""
+        config = language_model.config.get_text_config()
+        layers = len(attentions_of(language_model))
+        heads = config.num_attention_heads
+        return cls(embedding_dim, config.hidden_size, layers, heads, num_blocks, intermediate_size)
+
+    def forward(self, embeds: Tensor) -> Tensor:
+        """Adapter tokens a_l (B, L, C) of embeddings (B, D), of which only the direction counts."""
+        projected = self.projection(F.normalize(embeds.float(), dim=-1).to(self.projection.weight))
+        return self.blocks(projected)[:, None] + self.queries
+
+    def check_fits(self, language_model: PreTrainedModel) -> None:
+        """Raises `InvalidInputError` if a language model has no `o_proj`, or other sizes."""
+        config, ours = language_model.config.get_text_config(), self.config
+        theirs = {"hidden_size": config.hidden_size, "num_heads": config.num_attention_heads}
+        for name, size in {"num_layers": len(attentions_of(language_model)), **theirs}.items():
+            if ours[name] != size:
+                raise InvalidInputError(
+                    f"`language_bridge` has `{name}` {ours[name]}, but the language model {size}; pass the bridge that "
+                    "was made for it."
+                )
+
+    def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> Attachment:
+        """Lets a language model answer about embeddings (B, D), one for each of its inputs, until it is detached.
+
+        `generate` may repeat each input, as it does for beams and several answers. While gradients are on, they reach
+        the bridge. Not for several threads at once: each would see what all have attached.
+
+        Raises:
+            InvalidInputError: If the language model does not fit.
+            NonFiniteError: If an adapter token is not finite.
+        """
+        self.check_fits(language_model)
+        adapters, attached = self(embeds), Attachment()
+        if not bool(adapters.isfinite().all()):
+            raise NonFiniteError("The adapter of an embedding is not finite; run the bridge in float32 or bfloat16.")
+        for layer, attention in enumerate(attentions_of(language_model)):
+            hook = AdapterHook(self, attention, layer, adapters[:, layer])
+            attached.callback(attention.o_proj.register_forward_pre_hook(hook).remove)
+        return attached
+
+
+class AdapterHook:
+    """Adds the gated values of an adapter token (B, C) to the input of a layer's `o_proj`, (B n, T, H d)."""
+
+    def __init__(self, bridge: LanguageBridge, attention: Any, layer: int, adapter: Tensor):
+        self.bridge, self.attention, self.layer, self.adapter = bridge, attention, layer, adapter
+        self.value: Tensor | None = None  # known from the first forward on, when offloaded weights are in their place
+
+    def __call__(self, o_proj: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        states, *others = inputs
+        value = self.gated_value(states) if self.value is None else self.value
+        self.value = None if torch.is_grad_enabled() else value
+        if len(value) != len(states):
+            value = value.repeat_interleave(len(states) // len(value), dim=0)
+        return states + value[:, None], *others
+
+    def gated_value(self, states: Tensor) -> Tensor:
+        """tanh(g_h) (W_v a)_h of all heads, (B, H d)."""
+        bridge, attention, adapter = self.bridge, self.attention, self.adapter.to(states)
+        gates = bridge.gates[self.layer].tanh().to(states)
+        size = states.shape[-1] // len(gates)  # d, of a head
+        value_heads = attention.config.num_key_value_heads
+        project = attention.v_proj if hasattr(attention, "v_proj") else attention.qkv_proj  # v is its last part
+        value = project(adapter)[:, -value_heads * size :]
+        if bridge.value_down is not None and bridge.value_up is not None:
+            down, up = bridge.value_down[self.layer].to(states), bridge.value_up[self.layer].to(states)
+            value = value - adapter @ down.T @ up.T
+        value = value.unflatten(1, (value_heads, size)).repeat_interleave(len(gates) // value_heads, dim=1)
+        return (gates[:, None] * value).flatten(1).to(states)
+
+
+def attentions_of(language_model: PreTrainedModel) -> list[Any]:
+    """The attentions of a causal language model in order; raises `InvalidInputError` if none ends in `o_proj`."""
+    found = []
+    for module in language_model.modules():
+        if hasattr(module, "o_proj") and (hasattr(module, "v_proj") or hasattr(module, "qkv_proj")):
+            found.append(module)
+    if not found:
+        raise InvalidInputError(
+            f"`language_model` is a {type(language_model).__name__}, whose attention has no `o_proj`; pass one "
+            "like LLaMA."
+        )
+    return found

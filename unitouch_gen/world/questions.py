@@ -1,0 +1,91 @@
+"""Questions about contacts, with answers that are true of the draws and of what is measured of them."""
+
+import math
+
+from torch import Tensor
+
+from unitouch_gen.world.attributes import ATTRIBUTES
+from unitouch_gen.world.captions import HARDNESS_WORDS, ROUGHNESS_WORDS, described, direction_word, word_below
+from unitouch_gen.world.draws import Draws
+from unitouch_gen.world.grasps import grasp_margin
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.scene import YIELD
+
+QUESTIONS: dict[str, tuple[str, ...]] = {
+    "caption": ("Describe it.", "What is seen and felt?", "What can you say of this touch?"),
+    "material": ("What is it?", "What is it made of?", "Which material is this?"),
+    "feel": ("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
+    "place": ("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
+    "grain": ("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
+    "grasp": ("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
+}
+"""Topics, and how each may be asked about."""
+
+HELD_OUT_QUESTIONS: dict[str, str] = {
+    "material": "Name the material.", "feel": "Tell me how it feels.", "place": "Where on the gel is it?",
+    "grain": "How does the grain run?", "grasp": "Is this a good grasp?",
+}  # fmt: skip
+"""Wordings that nothing is trained on."""
+
+UNTOLD = 0.12  # share of the view in contact below which the material cannot be told
+ALL_OVER, CENTRED = 0.75, 0.2  # share above which contact is all over; distance, half views, of a contact in the centre
+
+
+def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[str, tuple[str, str]]]:
+    """A question and its answer of each contact and topic; variants ask and describe in other words.
+
+    Args:
+        draws: Of N contacts.
+        attributes: Theirs under a sensor, or the mean over several, (N, 13); see `ATTRIBUTES`.
+        variant: From 0.
+    """
+    rows = [dict(zip(ATTRIBUTES, row, strict=True)) for row in attributes.tolist()]
+    depth = draws.indentation_depth * (1.0 - YIELD * draws.compliance)
+    cover = attributes[:, ATTRIBUTES.index("cover")]
+    holds = (grasp_margin(draws.of_material("friction"), draws.weight, depth, cover) > 1.0).tolist()
+    captions = described(draws, variant)
+    found = []
+    for row, measured in enumerate(rows):
+        answers = {
+            "caption": captions[row] + ".",
+            "material": material_answer(draws, row, measured["cover"]),
+            "feel": feel_answer(draws, row),
+            "place": place_answer(measured["cover"], measured["place x"], measured["place y"]),
+            "grain": grain_answer(draws, row),
+            "grasp": "yes, it would hold." if holds[row] else "no, it would slip.",
+        }
+        asked = {topic: wordings[(row + variant) % len(wordings)] for topic, wordings in QUESTIONS.items()}
+        if "slip" in asked["grasp"]:
+            answers["grasp"] = "no, it would hold." if holds[row] else "yes, it would slip."
+        found.append({topic: (asked[topic], answer) for topic, answer in answers.items()})
+    return found
+
+
+def material_answer(draws: Draws, row: int, cover: float) -> str:
+    """The material, where enough of it is touched."""
+    name = MATERIALS[int(draws.material[row])].name
+    return f"it is {name}." if cover >= UNTOLD else "that cannot be told, too little of it is touched."
+
+
+def feel_answer(draws: Draws, row: int) -> str:
+    """Roughness, hardness, a word for the texture, and how its bumps are."""
+    spec = MATERIALS[int(draws.material[row])]
+    roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
+    hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
+    bumps = "regular" if spec.regular else "irregular"
+    return f"it feels {roughness}, {hardness} and {spec.feel[0]}, with {bumps} bumps."
+
+
+def place_answer(cover: float, x: float, y: float) -> str:
+    """Where the middle of the contact lies, in half views; y points down, as in a picture."""
+    if cover > ALL_OVER:
+        return "all over the view."
+    if math.hypot(x, y) < CENTRED:
+        return "in the centre."
+    return ("to the left.", "to the right.")[x > 0] if abs(x) > abs(y) else ("above.", "below.")[y > 0]
+
+
+def grain_answer(draws: Draws, row: int) -> str:
+    """The direction of the grain, to 22.5 degrees, if the material has one."""
+    grained = MATERIALS[int(draws.material[row])].grained
+    return f"it is {direction_word(float(draws.angle[row]))}." if grained else "it has no grain."
