@@ -1,4 +1,4 @@
-"""`unitouch-gen classify`, `convert`, `adapt` and `doctor`: what they write and print."""
+"""`unitouch-gen ask`, `classify`, `convert`, `adapt` and `doctor`: what they write and print."""
 
 import json
 from importlib.metadata import version
@@ -9,10 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.helpers.components import make_components
+from tests.helpers.language import make_language_parts
 from tests.helpers.published_files import published, small
+from tests.helpers.touch_llm import files_of as touch_llm_files
 from unitouch_gen import example, weights
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.models import UniTouchModel
+from unitouch_gen.pipelines import TouchToTextPipeline
 from unitouch_gen.pipelines.tiny import joint_space
 
 built_in = pytest.mark.skipif(
@@ -62,3 +66,28 @@ def test_doctor_says_what_a_picture_takes(command, models):
     code, out, err = command("doctor", "--model", models["x-to-touch"], "--device", "cpu")
     assert (code, err) == (0, "")
     assert all(word in out for word in (version("torch"), "Runs on cpu", str(Path(weights.__file__).parent), "2 steps"))
+
+
+def test_questions_are_answered_about_every_touch(command, refused, here, capsys):
+    parts, language = make_components(), make_language_parts()
+    joint = {name: parts[name] for name in ("unitouch", "processor")}
+    TouchToTextPipeline(**language, **joint).save_pretrained(here / "ask")
+    capsys.readouterr()
+    words = ("ask", "in", "How does it feel?", "--model", here / "ask", "--max-new-tokens", 4)
+    code, out, err = command(*words, "--json")
+    answers = [row["answer"] for row in json.loads(out)["touches"]]
+    assert (code, err, len(answers)) == (0, "", 2)
+    printed = command(*words)[1]
+    assert "bright.png: " in printed and all(answer in printed for answer in answers)
+    assert answers[0] in command("ask", "in/bright.png", *words[2:], "--stream")[1]
+    refused(command(*words[:2], " ", *words[3:]), "`question` is blank")
+
+
+def test_touch_llm_becomes_a_pipeline(command, tmp_path):
+    tokenizer = make_language_parts()["tokenizer"]
+    tokenizer.save_pretrained(tmp_path / "llama")
+    touch_llm_files(tmp_path / "llama", len(tokenizer), legacy=False)
+    words = ("--bridge", tmp_path / "llama.pth", "--llama", tmp_path / "llama", "-o", tmp_path / "out")
+    code, out, _ = command("convert", "touch-llm", *words)
+    assert code == 0 and "CC-BY-NC-4.0" in out
+    assert TouchToTextPipeline.from_pretrained(tmp_path / "out").embedding_dim == 16

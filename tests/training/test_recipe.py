@@ -13,18 +13,21 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.image_text import ImageTextRecipe
 from unitouch_gen.training.image_vae import AutoencoderRecipe, make_autoencoder
+from unitouch_gen.training.language_model import LanguageModelRecipe
 from unitouch_gen.training.picture_classifier import ClassifierRecipe
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.training.touch_ldm import TouchDiffusionRecipe
+from unitouch_gen.training.touch_llm import TouchLLMRecipe
 from unitouch_gen.training.unclip import UnclipRecipe
 
 KINDS: dict[str, type[Recipe]] = {
     "image_text": ImageTextRecipe, "audio": Recipe, "touch": TouchRecipe, "image_vae": AutoencoderRecipe,
     "unclip": UnclipRecipe, "picture_classifier": ClassifierRecipe, "touch_vae": AutoencoderRecipe,
     "touch_ldm": TouchDiffusionRecipe, "touch_classifier": ClassifierRecipe,
+    "language_model": LanguageModelRecipe, "touch_llm": TouchLLMRecipe,
 }  # fmt: skip
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
 

@@ -1,0 +1,142 @@
+"""`TouchToTextPipeline`: what it asks and answers, inputs that cannot be used, and folders."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from diffusers import DiffusionPipeline
+from torch.testing import assert_close
+from transformers import TextStreamer
+
+from tests.helpers.calls import seeded
+from tests.helpers.components import D
+from tests.helpers.language import make_language_parts
+from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models.language import LanguageBridge
+from unitouch_gen.pipelines import TouchToTextPipeline
+
+EMBEDS = torch.randn(3, D, generator=seeded(3))
+QUESTION, SHORT = "How does it feel?", {"max_new_tokens": 6, "min_new_tokens": 6}
+
+
+@pytest.fixture
+def ask(components):
+    joint = {name: components[name] for name in ("unitouch", "processor")}
+    bank = EmbeddingBank.of(torch.randn(20, D, generator=seeded(4)))
+    return TouchToTextPipeline(**make_language_parts(), **joint, embedding_bank=bank)
+
+
+def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, touch):
+    """Of each alone, without padding; and `embeds` bring them again."""
+    questions = [QUESTION, "Where is it?"]
+    output = ask(touch, questions, **SHORT)
+    embeds = ask.encode_touch(touch)
+    assert torch.equal(output.embeds, embeds)
+    assert_close(embeds, ask.embedding_bank.bridge(output.encoded))
+    for row, question in enumerate(questions):
+        ids = torch.tensor([ask.tokenizer(question)["input_ids"]])
+        with ask.language_bridge.attach(ask.language_model, embeds[row : row + 1]):
+            made = ask.language_model.generate(ids, attention_mask=torch.ones_like(ids), **SHORT)[0, ids.shape[1] :]
+        assert output.texts[row] == ask.tokenizer.decode(made, skip_special_tokens=True).strip()
+        assert output.report.prompt_tokens[row] == ids.shape[1]
+    assert output.report.tokens == [6, 6] and set(output.report.seconds) == {"touch", "answer"}
+    texts, report = ask(touch_embeds=embeds, question=questions, return_dict=False, **SHORT)
+    assert texts == output.texts and "12 tokens" in str(report)
+
+
+def test_one_input_has_several_questions_or_answers_and_several_touches_are_one_input(ask, touch, photo):
+    several = ask(touch_embeds=EMBEDS[:1], question=[QUESTION, "Where?"], num_beams=2, num_return_sequences=2, **SHORT)
+    assert len(several.texts) == 4 and several.embeds.shape == (1, D)
+    assert several.texts[:2] == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2,
+                                    **SHORT).texts  # fmt: skip
+    mixed = ask(touch, QUESTION, weights=[1, 3], bridge=False, **SHORT)
+    wanted = (torch.tensor([0.25, 0.75]) @ mixed.encoded)[None]
+    assert_close(torch.nn.functional.normalize(mixed.embeds), torch.nn.functional.normalize(wanted))
+    assert len(mixed.texts) == 1
+    seen = ask(image=photo, question=QUESTION, **SHORT)
+    assert_close(seen.embeds.norm(dim=1), torch.full((2,), 3.0)) and seen.encoded is None
+
+
+def test_a_seed_fixes_the_answer_whatever_threads_do_and_leaves_the_global_one_alone(ask):
+    def call(seed: int) -> list[str]:
+        options = {"do_sample": True, "generator": seeded(seed), **SHORT}
+        return ask(touch_embeds=EMBEDS[seed % 3][None], question=QUESTION, **options).texts
+
+    before = torch.random.get_rng_state()
+    expected = [call(seed) for seed in range(6)]
+    assert len({*map(tuple, expected)}) > 1 and torch.equal(torch.random.get_rng_state(), before)
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(call, range(6))) == expected
+
+
+def test_prompts_are_put_as_the_language_model_was_trained(ask, capsys):
+    sizes = []
+    for template, chat in (
+        ("{question}", None),
+        ("Q: {question} A:", None),
+        ("{question}", "[{{ messages[0].content }}]"),
+    ):
+        ask.register_to_config(prompt_template=template)
+        ask.tokenizer.chat_template = chat
+        streamer = TextStreamer(ask.tokenizer)
+        output = ask(touch_embeds=EMBEDS[:1], question="Where?", streamer=streamer, **SHORT)
+        printed = capsys.readouterr().out
+        wanted = "[Where?]" if chat else "<s>" + template.replace("{question}", "Where?")
+        assert printed.startswith(wanted) and printed.strip().endswith(output.texts[0])
+        sizes += output.report.prompt_tokens
+    assert len({*sizes}) > 1
+
+
+def test_a_saved_pipeline_answers_the_same_also_by_diffusers(ask, touch, tmp_path):
+    output = ask(touch, QUESTION, **SHORT)
+    ask.save_pretrained(tmp_path / "ask")
+    assert "print(output.texts[0])" in (tmp_path / "ask" / "README.md").read_text()
+    loaded = DiffusionPipeline.from_pretrained(tmp_path / "ask", trust_remote_code=True)
+    for pipe in (loaded, TouchToTextPipeline.from_pretrained(tmp_path / "ask", dtype=torch.float32)):
+        assert pipe(touch, QUESTION, **SHORT).texts == output.texts
+    assert ask.to(torch.bfloat16)(touch, QUESTION, **SHORT).report.tokens == [6, 6]
+
+
+def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, touch, photo):
+    def fail(module, *args):
+        raise AssertionError(f"{type(module).__name__} ran on input that cannot be used")
+
+    for network in (ask.language_bridge, ask.language_model, ask.unitouch.touch_model, ask.unitouch.vision_model):
+        network.register_forward_pre_hook(fail)
+    two = {"touch": touch, "question": QUESTION}
+    for name, error, options in (
+        ("touch", InvalidInputError, {"question": QUESTION}), ("touch", InvalidInputError, {**two, "image": photo}),
+        ("question", InvalidTypeError, {"touch": touch}), ("question", InvalidInputError, {**two, "question": " \n"}),
+        ("question", InvalidInputError, {**two, "question": [QUESTION] * 3}),
+        ("question", InvalidInputError, {**two, "question": "a" * 64}),
+        ("max_new_tokens", InvalidInputError, {**two, "max_new_tokens": 64}),
+        ("max_new_tokens", InvalidTypeError, {**two, "max_new_tokens": 2.5}),
+        ("temperatur", InvalidInputError, {**two, "temperatur": 0.5}),
+        ("generate", InvalidInputError, {**two, "early_stopping": "soon"}),
+        ("streamer", InvalidInputError, {**two, "streamer": TextStreamer(ask.tokenizer)}),
+        ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
+        ("generator", InvalidTypeError, {**two, "generator": 3}), ("bridge", InvalidTypeError, {**two, "bridge": "x"}),
+        ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),
+        ("bridge", InvalidInputError, {"image": photo, "question": QUESTION, "bridge": True}),
+    ):  # fmt: skip
+        with pytest.raises(error, match=f"`{name}`") as caught:
+            ask(**options)
+        assert type(caught.value) is error
+    with pytest.raises(AssertionError, match="ran on input"):
+        ask(**two)
+
+
+def test_parts_that_do_not_fit_are_refused(components):
+    parts = make_language_parts()
+    joint = {name: components[name] for name in ("unitouch", "processor")}
+    for words, change in (
+        ("`unitouch` has width 16, but `language_bridge` takes 8",
+         {"language_bridge": LanguageBridge.for_model(parts["language_model"], 8), **joint}),
+        ("`num_layers`", {"language_model": make_language_parts(num_hidden_layers=3)["language_model"]}),
+        ("`prompt_template` is 'Answer'", {"prompt_template": "Answer"}),
+    ):  # fmt: skip
+        with pytest.raises(InvalidInputError, match=words):
+            TouchToTextPipeline(**{**parts, **change})
+    with pytest.raises(InvalidInputError, match="`touch` needs the joint space"):
+        TouchToTextPipeline(**parts)(torch.rand(3, 32, 32), QUESTION)
