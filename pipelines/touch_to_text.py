@@ -102,6 +102,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         """
         # 1. Check inputs, before any network runs
         given = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
+        inputs: Any
         name, *others = [name for name, value in given.items() if value is not None] or [""]
         if others or not name:
             raise InvalidInputError("`touch`, `image` or `touch_embeds` has to be passed, one of them.")
@@ -211,8 +212,10 @@ class TouchToTextPipeline(UniTouchPipeline):
         *, dtype: torch.dtype = torch.float32,
     ) -> Self:  # fmt: skip
         """Builds on Touch-LLM's published `bridge` and a `llama`, see `read_touch_llm`, and a converted joint space."""
-        joint = {} if unitouch is None else dict(zip(("unitouch", "processor"), read_joint(unitouch, dtype, {})))
-        return cls(**read_touch_llm(bridge, llama, dtype=dtype), **joint)
+        parts = read_touch_llm(bridge, llama, dtype=dtype)
+        if unitouch is not None:
+            parts["unitouch"], parts["processor"] = read_joint(unitouch, dtype, {})
+        return cls(**parts)
 
 
 @contextmanager

@@ -25,24 +25,19 @@ def published(folder: Path, legacy: bool = False):
     return folder, folder.with_suffix(".pth"), *files_of(folder, len(TOKENIZER), legacy)
 
 
-def in_transformers_layout(folder: Path, llama: dict, place: Path) -> Path:
+NAMES = {"tok_embeddings": "model.embed_tokens", "output": "lm_head", "layers": "model.layers", "norm": "model.norm",
+         "attention_norm": "input_layernorm", "ffn_norm": "post_attention_layernorm", "attention": "self_attn",
+         "feed_forward": "mlp", "w1": "gate_proj", "w2": "down_proj", "w3": "up_proj",
+         **{f"w{one}": f"{one}_proj" for one in "qkvo"}}  # fmt: skip
+
+
+def in_transformers_layout(llama: dict, place: Path) -> Path:
     """The LLaMA alone, permuted as transformers' own script does."""
     sizes = {"hidden_size": DIM, "intermediate_size": HIDDEN, "num_hidden_layers": LAYERS, "num_attention_heads": HEADS}
     model = LlamaForCausalLM(LlamaConfig(**sizes, vocab_size=len(TOKENIZER), rms_norm_eps=1e-5))
-    mlp = {"gate_proj": "feed_forward.w1", "down_proj": "feed_forward.w2", "up_proj": "feed_forward.w3"}
-    names = {"self_attn": {f"{one}_proj": f"attention.w{one}" for one in "qkvo"}, "mlp": mlp}
-    state = {"model.embed_tokens.weight": llama["tok_embeddings.weight"], "lm_head.weight": llama["output.weight"],
-             "model.norm.weight": llama["norm.weight"]}  # fmt: skip
-    for layer in range(LAYERS):
-        ours, theirs = f"model.layers.{layer}", f"layers.{layer}"
-        for part, linears in names.items():
-            for name, published_name in linears.items():
-                weight = llama[f"{theirs}.{published_name}.weight"]
-                if name in ("q_proj", "k_proj"):
-                    weight = weight.view(HEADS, DIM // HEADS // 2, 2, DIM).transpose(1, 2).reshape(DIM, DIM)
-                state[f"{ours}.{part}.{name}.weight"] = weight
-        state[f"{ours}.input_layernorm.weight"] = llama[f"{theirs}.attention_norm.weight"]
-        state[f"{ours}.post_attention_layernorm.weight"] = llama[f"{theirs}.ffn_norm.weight"]
+    state = {".".join(NAMES.get(part, part) for part in key.split(".")): value for key, value in llama.items()}
+    for key in [key for key in state if "q_proj" in key or "k_proj" in key]:
+        state[key] = state[key].view(HEADS, DIM // HEADS // 2, 2, DIM).transpose(1, 2).reshape(DIM, DIM)
     model.load_state_dict(state)
     model.save_pretrained(place)
     TOKENIZER.save_pretrained(place)
@@ -54,25 +49,21 @@ def in_transformers_layout(folder: Path, llama: dict, place: Path) -> Path:
 def test_logits_and_greedy_text_are_those_of_the_release(tmp_path, legacy, layout):
     folder, bridge, llama, weights = published(tmp_path / "llama", legacy)
     if layout == "transformers":
-        folder = in_transformers_layout(folder, llama, tmp_path / "hf")
+        folder = in_transformers_layout(llama, tmp_path / "hf")
     pipe = TouchToTextPipeline.from_published(bridge, folder)
-    ids = torch.randint(3, len(TOKENIZER), (2, 9), generator=torch.Generator().manual_seed(2))
+    ids = torch.tensor(TOKENIZER(["How?"] * 2)["input_ids"])
+    options = {"max_new_tokens": 6, "min_new_tokens": 6, "do_sample": False}
     with pipe.language_bridge.attach(pipe.language_model, EMBEDS):
-        found = pipe.language_model(ids).logits
-    wanted = logits_of(llama, weights, EMBEDS, ids)
+        made = pipe.language_model.generate(ids, attention_mask=torch.ones_like(ids), **options)
+        found = pipe.language_model(made).logits
+    wanted = logits_of(llama, weights, EMBEDS, made)
     assert_close(found, wanted, atol=1e-5 * float(wanted.abs().max()), rtol=0)
-    assert pipe.language_model.generation_config.temperature == 0.1
-
+    wanted[..., 2] = -torch.inf  # </s>
+    assert torch.equal(made[:, ids.shape[1] :], wanted[:, ids.shape[1] - 1 : -1].argmax(dim=-1))
+    assert pipe.language_model.generation_config.temperature == 0.1 and "### Response:" in pipe.config.prompt_template
     pipe.register_to_config(prompt_template="{question}")
-    made = pipe(touch_embeds=EMBEDS, question="How?", max_new_tokens=6, do_sample=False).texts
-    tokens = torch.tensor(TOKENIZER(["How?"] * 2)["input_ids"])
-    start = tokens.shape[1]
-    for _ in range(6):
-        following = logits_of(llama, weights, EMBEDS, tokens)[:, -1].argmax(dim=-1)
-        tokens = torch.cat([tokens, following[:, None]], dim=1)
-    ends = [row.index(2) if 2 in row else 6 for row in tokens[:, start:].tolist()]
-    texts = [TOKENIZER.decode(row[start : start + end]) for row, end in zip(tokens, ends, strict=True)]
-    assert made == [TOKENIZER.decode(TOKENIZER(text)["input_ids"], skip_special_tokens=True).strip() for text in texts]
+    texts = pipe(touch_embeds=EMBEDS, question="How?", **options).texts
+    assert texts == [TOKENIZER.decode(row[ids.shape[1] :], skip_special_tokens=True).strip() for row in made]
 
 
 class Code:

@@ -32,7 +32,7 @@ PROMPT = (
 )
 SAMPLING = {"do_sample": True, "temperature": 0.1, "top_p": 0.75, "max_new_tokens": 256}
 POSITIONS = 512  # that it was fine-tuned on
-BIASES = {"attention_bias": True, "mlp_bias": True}  # which a LLaMA has not
+BIASES: dict[str, Any] = {"attention_bias": True, "mlp_bias": True}  # which a LLaMA has not
 
 
 @torch.no_grad()
@@ -44,11 +44,8 @@ def read_touch_llm(
     `llama` is a folder in transformers' layout, or in that of its authors: params.json and one *.pth, beside a
     tokenizer that transformers reads. Raises `InvalidInputError` if a file cannot be read, or they do not fit.
     """
-    dtype, folder, tensors = (
-        check_dtype("dtype", dtype),
-        local_folder("llama", llama),
-        open_checkpoint("bridge", bridge),
-    )
+    dtype, folder = check_dtype("dtype", dtype), local_folder("llama", llama)
+    tensors = open_checkpoint("bridge", bridge)
     with reading("llama", folder):
         tokenizer = AutoTokenizer.from_pretrained(folder)
         if (folder / "params.json").is_file():
@@ -66,7 +63,7 @@ def read_touch_llm(
     made.check_fits(model)
     model.config.max_position_embeddings = min(POSITIONS, model.config.max_position_embeddings)
     model.generation_config.update(**SAMPLING)
-    parts = {"language_bridge": made.to(dtype).eval(), "language_model": model.to(dtype).eval()}
+    parts = {"language_bridge": made.to(dtype).eval(), "language_model": model.to(dtype=dtype).eval()}
     return {**parts, "tokenizer": tokenizer, "prompt_template": PROMPT}
 
 
@@ -107,7 +104,7 @@ def bridge_of(tensors: dict[str, Tensor], layers: int) -> LanguageBridge:
     return made
 
 
-def lay_over(model: LlamaForCausalLM, tensors: dict[str, Tensor]) -> None:
+def lay_over(model: Any, tensors: dict[str, Tensor]) -> None:
     """Writes a checkpoint's weights, low-rank updates, biases and norms over those of a LLaMA."""
     names = {ours: f"llama.{theirs}" for ours, theirs in OUTER.items()}
     for layer in range(model.config.num_hidden_layers):

@@ -1,7 +1,5 @@
 """The language bridge: its equation, every way to generate, and a language model that stays as it was."""
 
-import threading
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -16,7 +14,6 @@ from transformers import (
     Phi3Config,
     Qwen2Config,
     Qwen3Config,
-    TextIteratorStreamer,
 )  # fmt: skip
 
 from tests.helpers.components import D
@@ -96,19 +93,6 @@ def test_inputs_of_a_batch_get_what_each_gets_alone(parts, mode):
         assert torch.equal(alone, together[row * len(alone) : (row + 1) * len(alone)])
 
 
-def test_words_are_streamed_as_they_are_generated():
-    made = make_language_parts()
-    bridge, model, tokenizer = made["language_bridge"], made["language_model"], made["tokenizer"]
-    with bridge.attach(model, EMBEDS[:1]), torch.no_grad():
-        whole = tokenizer.decode(generate(model, slice(1))[0, 6:])
-        streamer = TextIteratorStreamer(tokenizer, skip_prompt=True, timeout=60)
-        thread = threading.Thread(target=generate, args=(model, slice(1)), kwargs={"streamer": streamer})
-        thread.start()
-        pieces = list(streamer)
-        thread.join()
-    assert "".join(pieces) == whole
-
-
 @pytest.mark.parametrize(
     ("kind", "sizes"),
     [
@@ -130,20 +114,15 @@ def test_any_attention_that_ends_in_o_proj_takes_a_bridge(kind, sizes):
         assert (model(IDS).logits - before).abs().max() > 1e-4
 
 
-def test_gradients_reach_the_bridge_alone_also_through_checkpointed_blocks(parts):
+@pytest.mark.parametrize("checkpointed", [False, True])
+def test_gradients_reach_all_of_the_bridge_and_it_alone(parts, checkpointed):
     bridge, model = parts
+    if checkpointed:
+        model.train().activation_checkpointing_enable()
     model.requires_grad_(False)
-    grads = []
-    for checkpointed in (False, True):
-        if checkpointed:
-            model.activation_checkpointing_enable()
-            model.train()
-        bridge.zero_grad()
-        with bridge.attach(model, EMBEDS):
-            model(input_ids=IDS, labels=IDS, use_cache=False).loss.backward()
-        grads.append([parameter.grad.clone() for parameter in bridge.parameters()])
-        assert all(bool(grad.any()) for grad in grads[-1])
-    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*grads, strict=True))
+    with bridge.attach(model, EMBEDS):
+        model(input_ids=IDS, labels=IDS, use_cache=False).loss.backward()
+    assert all(bool(parameter.grad.any()) for parameter in bridge.parameters())
     assert all(parameter.grad is None for parameter in model.parameters())
 
 

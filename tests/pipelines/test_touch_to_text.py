@@ -6,7 +6,7 @@ import pytest
 import torch
 from diffusers import DiffusionPipeline
 from torch.testing import assert_close
-from transformers import TextStreamer
+from transformers import TextIteratorStreamer
 
 from tests.helpers.calls import seeded
 from tests.helpers.components import D
@@ -70,18 +70,17 @@ def test_a_seed_fixes_the_answer_whatever_threads_do_and_leaves_the_global_one_a
         assert list(pool.map(call, range(6))) == expected
 
 
-def test_prompts_are_put_as_the_language_model_was_trained(ask, capsys):
+def test_prompts_are_put_as_the_language_model_was_trained_and_streamed(ask):
     sizes = []
-    for template, chat in (
-        ("{question}", None),
-        ("Q: {question} A:", None),
-        ("{question}", "[{{ messages[0].content }}]"),
-    ):
+    chat_template = "[{{ messages[0].content }}]"
+    for template, chat in (("{question}", None), ("Q: {question} A:", None), ("{question}", chat_template)):
         ask.register_to_config(prompt_template=template)
         ask.tokenizer.chat_template = chat
-        streamer = TextStreamer(ask.tokenizer)
-        output = ask(touch_embeds=EMBEDS[:1], question="Where?", streamer=streamer, **SHORT)
-        printed = capsys.readouterr().out
+        streamer, given = TextIteratorStreamer(ask.tokenizer, timeout=60), {"touch_embeds": EMBEDS[:1], **SHORT}
+        with ThreadPoolExecutor(1) as pool:
+            answer = pool.submit(ask, question="Where?", streamer=streamer, **given)
+            printed = "".join(streamer)
+            output = answer.result()
         wanted = "[Where?]" if chat else "<s>" + template.replace("{question}", "Where?")
         assert printed.startswith(wanted) and printed.strip().endswith(output.texts[0])
         sizes += output.report.prompt_tokens
@@ -114,7 +113,7 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("max_new_tokens", InvalidTypeError, {**two, "max_new_tokens": 2.5}),
         ("temperatur", InvalidInputError, {**two, "temperatur": 0.5}),
         ("generate", InvalidInputError, {**two, "early_stopping": "soon"}),
-        ("streamer", InvalidInputError, {**two, "streamer": TextStreamer(ask.tokenizer)}),
+        ("streamer", InvalidInputError, {**two, "streamer": TextIteratorStreamer(ask.tokenizer)}),
         ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
         ("generator", InvalidTypeError, {**two, "generator": 3}), ("bridge", InvalidTypeError, {**two, "bridge": "x"}),
         ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),

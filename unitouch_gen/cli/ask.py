@@ -30,15 +30,16 @@ def ask(
     import torch
     from transformers import TextStreamer
 
-    answers, given = list[dict[str, Any]](), {"sensor": sensor, "max_new_tokens": max_new_tokens}
+    answers, given = list[dict[str, Any]](), dict[str, Any](sensor=sensor, max_new_tokens=max_new_tokens)
     if stream:
         given["streamer"] = TextStreamer(pipe.tokenizer, skip_prompt=True, skip_special_tokens=True)
     for file in touches:
-        if not as_json and len(touches) > 1:
-            echo(f"{file.name}: ", nl=stream)
+        name = f"{file.name}: " if len(touches) > 1 else ""
+        if stream:
+            echo(name, nl=False)
         output = pipe(file, question, generator=torch.Generator().manual_seed(seed), **given)
         answers.append({"touch": str(file), "answer": output.texts[0], "report": output.report.to_dict()})
         if not (stream or as_json):
-            echo(output.texts[0])
+            echo(name + output.texts[0])
     if as_json:
         echo(json.dumps({"question": question, "touches": answers}))

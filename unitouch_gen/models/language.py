@@ -97,16 +97,18 @@ class LanguageBridge(ModelMixin, ConfigMixin):
         projected = self.projection(F.normalize(embeds.float(), dim=-1).to(self.projection.weight))
         return self.blocks(projected)[:, None] + self.queries
 
-    def check_fits(self, language_model: PreTrainedModel) -> None:
-        """Raises `InvalidInputError` if a language model has no `o_proj`, or other sizes."""
+    def check_fits(self, language_model: PreTrainedModel) -> list[Any]:
+        """The language model's attentions; raises `InvalidInputError` if it has no `o_proj`, or other sizes."""
+        attentions = attentions_of(language_model)
         config, ours = language_model.config.get_text_config(), self.config
         theirs = {"hidden_size": config.hidden_size, "num_heads": config.num_attention_heads}
-        for name, size in {"num_layers": len(attentions_of(language_model)), **theirs}.items():
+        for name, size in {"num_layers": len(attentions), **theirs}.items():
             if ours[name] != size:
                 raise InvalidInputError(
                     f"`language_bridge` has `{name}` {ours[name]}, but the language model {size}; pass the bridge that "
                     "was made for it."
                 )
+        return attentions
 
     def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> Attachment:
         """Lets a language model answer about embeddings (B, D), one for each of its inputs, until it is detached.
@@ -118,11 +120,11 @@ class LanguageBridge(ModelMixin, ConfigMixin):
             InvalidInputError: If the language model does not fit.
             NonFiniteError: If an adapter token is not finite.
         """
-        self.check_fits(language_model)
+        attentions = self.check_fits(language_model)
         adapters, attached = self(embeds), Attachment()
         if not bool(adapters.isfinite().all()):
             raise NonFiniteError("The adapter of an embedding is not finite; run the bridge in float32 or bfloat16.")
-        for layer, attention in enumerate(attentions_of(language_model)):
+        for layer, attention in enumerate(attentions):
             hook = AdapterHook(self, attention, layer, adapters[:, layer])
             attached.callback(attention.o_proj.register_forward_pre_hook(hook).remove)
         return attached
@@ -135,16 +137,16 @@ class AdapterHook:
         self.bridge, self.attention, self.layer, self.adapter = bridge, attention, layer, adapter
         self.value: Tensor | None = None  # known from the first forward on, when offloaded weights are in their place
 
-    def __call__(self, o_proj: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        states, *others = inputs
+    def __call__(self, o_proj: nn.Module, inputs: tuple[Tensor]) -> Tensor:
+        (states,) = inputs
         value = self.gated_value(states) if self.value is None else self.value
         self.value = None if torch.is_grad_enabled() else value
         if len(value) != len(states):
             value = value.repeat_interleave(len(states) // len(value), dim=0)
-        return states + value[:, None], *others
+        return states + value
 
     def gated_value(self, states: Tensor) -> Tensor:
-        """tanh(g_h) (W_v a)_h of all heads, (B, H d)."""
+        """tanh(g_h) (W_v a)_h of all heads, (B, 1, H d)."""
         bridge, attention, adapter = self.bridge, self.attention, self.adapter.to(states)
         gates = bridge.gates[self.layer].tanh().to(states)
         size = states.shape[-1] // len(gates)  # d, of a head
@@ -155,7 +157,7 @@ class AdapterHook:
             down, up = bridge.value_down[self.layer].to(states), bridge.value_up[self.layer].to(states)
             value = value - adapter @ down.T @ up.T
         value = value.unflatten(1, (value_heads, size)).repeat_interleave(len(gates) // value_heads, dim=1)
-        return (gates[:, None] * value).flatten(1).to(states)
+        return (gates[:, None] * value).flatten(1).to(states)[:, None]
 
 
 def attentions_of(language_model: PreTrainedModel) -> list[Any]:

@@ -8,7 +8,7 @@ from unitouch_gen.world.attributes import ATTRIBUTES
 from unitouch_gen.world.captions import HARDNESS_WORDS, ROUGHNESS_WORDS, described, direction_word, word_below
 from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.grasps import grasp_margin
-from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.materials import MATERIALS, Material
 from unitouch_gen.world.scene import YIELD
 
 QUESTIONS: dict[str, tuple[str, ...]] = {
@@ -21,13 +21,8 @@ QUESTIONS: dict[str, tuple[str, ...]] = {
 }
 """Topics, and how each may be asked about."""
 
-HELD_OUT_QUESTIONS: dict[str, str] = {
-    "material": "Name the material.", "feel": "Tell me how it feels.", "place": "Where on the gel is it?",
-    "grain": "How does the grain run?", "grasp": "Is this a good grasp?",
-}  # fmt: skip
-"""Wordings that nothing is trained on."""
-
 UNTOLD = 0.12  # share of the view in contact below which the material cannot be told
+PLACE = ("cover", "place x", "place y")
 ALL_OVER, CENTRED = 0.75, 0.2  # share above which contact is all over; distance, half views, of a contact in the centre
 
 
@@ -39,41 +34,32 @@ def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[st
         attributes: Theirs under a sensor, or the mean over several, (N, 13); see `ATTRIBUTES`.
         variant: From 0.
     """
-    rows = [dict(zip(ATTRIBUTES, row, strict=True)) for row in attributes.tolist()]
+    measured = dict(zip(ATTRIBUTES, attributes.T.tolist(), strict=True))
     depth = draws.indentation_depth * (1.0 - YIELD * draws.compliance)
     cover = attributes[:, ATTRIBUTES.index("cover")]
     holds = (grasp_margin(draws.of_material("friction"), draws.weight, depth, cover) > 1.0).tolist()
-    captions = described(draws, variant)
-    found = []
-    for row, measured in enumerate(rows):
-        answers = {
-            "caption": captions[row] + ".",
-            "material": material_answer(draws, row, measured["cover"]),
-            "feel": feel_answer(draws, row),
-            "place": place_answer(measured["cover"], measured["place x"], measured["place y"]),
-            "grain": grain_answer(draws, row),
-            "grasp": "yes, it would hold." if holds[row] else "no, it would slip.",
-        }
+    captions, found = described(draws, variant), []
+    for row in range(len(draws)):
+        spec, place = MATERIALS[int(draws.material[row])], (measured[name][row] for name in PLACE)
         asked = {topic: wordings[(row + variant) % len(wordings)] for topic, wordings in QUESTIONS.items()}
-        if "slip" in asked["grasp"]:
-            answers["grasp"] = "no, it would hold." if holds[row] else "yes, it would slip."
+        agreed = holds[row] != ("slip" in asked["grasp"])
+        answers = {
+            "caption": f"{captions[row]}.",
+            "material": f"it is {spec.name}." if measured["cover"][row] >= UNTOLD else "that cannot be told.",
+            "feel": feel_answer(spec, float(draws.amplitude[row]), float(draws.compliance[row])),
+            "place": place_answer(*place),
+            "grain": f"it is {direction_word(float(draws.angle[row]))}." if spec.grained else "it has no grain.",
+            "grasp": f"{'yes' if agreed else 'no'}, it would {'hold' if holds[row] else 'slip'}.",
+        }
         found.append({topic: (asked[topic], answer) for topic, answer in answers.items()})
     return found
 
 
-def material_answer(draws: Draws, row: int, cover: float) -> str:
-    """The material, where enough of it is touched."""
-    name = MATERIALS[int(draws.material[row])].name
-    return f"it is {name}." if cover >= UNTOLD else "that cannot be told, too little of it is touched."
-
-
-def feel_answer(draws: Draws, row: int) -> str:
+def feel_answer(spec: Material, amplitude: float, compliance: float) -> str:
     """Roughness, hardness, a word for the texture, and how its bumps are."""
-    spec = MATERIALS[int(draws.material[row])]
-    roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
-    hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
+    roughness = word_below(ROUGHNESS_WORDS, spec.roughness * amplitude)
     bumps = "regular" if spec.regular else "irregular"
-    return f"it feels {roughness}, {hardness} and {spec.feel[0]}, with {bumps} bumps."
+    return f"it feels {roughness}, {word_below(HARDNESS_WORDS, compliance)} and {spec.feel[0]}, with {bumps} bumps."
 
 
 def place_answer(cover: float, x: float, y: float) -> str:
@@ -83,9 +69,3 @@ def place_answer(cover: float, x: float, y: float) -> str:
     if math.hypot(x, y) < CENTRED:
         return "in the centre."
     return ("to the left.", "to the right.")[x > 0] if abs(x) > abs(y) else ("above.", "below.")[y > 0]
-
-
-def grain_answer(draws: Draws, row: int) -> str:
-    """The direction of the grain, to 22.5 degrees, if the material has one."""
-    grained = MATERIALS[int(draws.material[row])].grained
-    return f"it is {direction_word(float(draws.angle[row]))}." if grained else "it has no grain."
