@@ -68,8 +68,8 @@ def pairs_of(sources: Sequence[Source], splits: Sequence[Rendered]) -> list[Pair
 
 def encoded(tokenizer: PreTrainedTokenizerBase, pairs: Sequence[Pairs]) -> dict[str, Tensor]:
     """Columns of token ids, and of labels, which are those of answers, int16 (N, V, T)."""
-    prompts, answers = zip(*(pair for one in pairs for pair in one), strict=True)
-    prompts = [PROMPT.replace("{question}", question) for question in prompts]
+    questions, answers = zip(*(pair for one in pairs for pair in one), strict=True)
+    prompts = [PROMPT.replace("{question}", question) for question in questions]
     tokens = tokenizer(prompts, list(answers), padding=True, return_token_type_ids=True, return_tensors="pt")
     ids = tokens["input_ids"].short()
     columns = {"input_ids": ids, "labels": ids.masked_fill(tokens["token_type_ids"] == 0, -100)}

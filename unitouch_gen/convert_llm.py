@@ -46,6 +46,7 @@ def read_touch_llm(
     """
     dtype, folder = check_dtype("dtype", dtype), local_folder("llama", llama)
     tensors = open_checkpoint("bridge", bridge)
+    model: Any
     with reading("llama", folder):
         tokenizer = AutoTokenizer.from_pretrained(folder)
         if (folder / "params.json").is_file():

@@ -40,9 +40,9 @@ def unitouch(
 @app.command()
 def touch_llm(
     bridge: Annotated[Path, Option(**FILE, help="Touch-LLM's checkpoint.")],
-    llama: Annotated[Path, Option(exists=True, file_okay=False, help="Folder of the LLaMA it was trained on.")],
+    llama: Annotated[str, Option(help="Folder or repository id of the LLaMA it was trained on.")],
     output: Annotated[Path, Option("--output", "-o", help="A folder for the pipeline.")],
-    unitouch: Annotated[Path | None, Option(exists=True, help="Folder that `convert unitouch` wrote.")] = None,
+    unitouch: Annotated[str | None, Option(help="Folder that `convert unitouch` wrote.")] = None,
     dtype: Annotated[str, Option(help="float32, float16 or bfloat16.")] = "float16",
 ) -> None:
     """Converts Touch-LLM's checkpoint: its bridge, and the LLaMA with what was fine-tuned of it.
