@@ -56,11 +56,6 @@ class LanguageBridge(ModelMixin, ConfigMixin):
         legacy: Blocks with LayerNorm and biases.
         value_rank: r of a low-rank pair that is in W_v, and is not used for a_l: the release fine-tunes W_v for words
             alone.
-
-    Example:
-        >>> bridge = LanguageBridge.for_model(language_model, embedding_dim=1024)  # doctest: +SKIP
-        >>> with bridge.attach(language_model, embeds):  # doctest: +SKIP
-        ...     language_model.generate(**inputs)
     """
 
     save_pretrained = saved_whole(ModelMixin.save_pretrained)
