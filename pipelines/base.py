@@ -406,8 +406,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         )  # diffusers' download cannot resolve our components
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
-            parts = ("unet", "vae", "embedding_bank", "backgrounds", "text_encoder", "image_normalizer", "language_bridge")
-            for part in parts:
+            conditioning = ("embedding_bank", "backgrounds", "image_normalizer", "language_bridge")
+            for part in ("unet", "vae", "text_encoder", *conditioning):
                 if part not in kwargs:
                     check_filled(folder / part, getattr(pipe, part, None))
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
