@@ -58,7 +58,6 @@ MAX_IMAGES = 100_000  # maximum per input
 MAX_SIDE = 16_384  # pixels
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
-
 SMALL_NETWORK = 20_000_000
 """Parameters below which threads of a CPU wait for each other longer than they work."""
 

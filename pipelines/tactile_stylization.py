@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -37,35 +38,34 @@ class LayoutHold:
     D' = D + F(photo - D). Only the denoiser changes: every solver, adaptive steps and guidance run as they are.
 
     Args:
-        photo: Latents (B, C, h, w).
+        scheduler: Of the network, with noise levels to choose from.
         cells: F averages over a grid of so many cells along the shorter side, and interpolates between them.
         keep_colours: Whether the mean of each channel is held, too.
-        schedule, prediction_type: Of the network.
     """
 
-    def __init__(self, photo: Tensor, cells: int, keep_colours: bool, schedule: NoiseSchedule, prediction_type: str):
-        self.photo, self.keep_colours = photo.float(), keep_colours
-        share = min(cells / min(photo.shape[-2:]), 1.0)
-        self.grid = [max(round(share * side), 1) for side in photo.shape[-2:]]
-        self.schedule, self.prediction_type = schedule, prediction_type
+    def __init__(self, scheduler: Any, cells: int, keep_colours: bool):
+        self.schedule, self.prediction_type = NoiseSchedule.of(scheduler), scheduler.config.prediction_type
+        self.cells, self.keep_colours = cells, keep_colours
 
     def coarse(self, values: Tensor) -> Tensor:
         """F: the part of (B, C, h, w) that is held."""
         size = values.shape[-2:]
-        cells = F.interpolate(values, self.grid, mode="bilinear", antialias=True)
+        share = min(self.cells / min(size), 1.0)
+        grid = [max(round(share * side), 1) for side in size]
+        cells = F.interpolate(values, grid, mode="bilinear", antialias=True)
         smooth = F.interpolate(cells, size, mode="bicubic")
         return smooth if self.keep_colours else smooth - smooth.mean(dim=(2, 3), keepdim=True)
 
-    def __call__(self, network: Network) -> Network:
-        """The network with D' in place of D; states (B or 2 B, C, h, w)."""
+    def wrap(self, network: Network, photo: Tensor) -> Network:
+        """The network with D' in place of D, of photos' latents (B, C, h, w); states (B or 2 B, C, h, w)."""
 
         def held(z: Tensor, timestep: Tensor) -> Tensor:
             prediction, sigma = network(z, timestep).float(), self.schedule.sigma(timestep.cpu()).item()
             denoised = to_denoised(prediction, z, sigma, self.prediction_type)
             one = torch.ones((), dtype=torch.float32)
             slope = to_denoised(one, 0.0 * one, sigma, self.prediction_type).item()  # dD / dprediction
-            photo = self.photo.repeat(len(z) // len(self.photo), 1, 1, 1)
-            return prediction + self.coarse(photo - denoised) / slope
+            target = photo.float().repeat(len(z) // len(photo), 1, 1, 1)
+            return prediction + self.coarse(target - denoised) / slope
 
         return held
 
@@ -143,11 +143,10 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         strength = check_number("strength", strength, 0.0, MAX_SCALE)
         check_choice("mix", mix, MIXES)
         check_number("init_strength", init_strength, 0.0, 1.0)
-        schedule = None
-        if layout is not None:
-            check_integer("layout", layout, 2)
-            schedule = NoiseSchedule.of(self.scheduler)
         check_kind("keep_colours", keep_colours, bool)
+        hold = None
+        if layout is not None:
+            hold = LayoutHold(self.scheduler, check_integer("layout", layout, 2), keep_colours)
         if touch_weight is None:
             touch_weight = 0.3 if layout is None else 0.7
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
@@ -175,17 +174,15 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         # 3. Encode the photo's own latents
         photo: Any = None
-        if init_strength < 1.0 or layout is not None:
+        if init_strength < 1.0 or hold is not None:
             with report.stage("photo latents"):
                 photo = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
                 photo = photo.repeat_interleave(settings.repeats, dim=0)
 
         # 4. Generate from the mixed embedding
-        hold = None
-        if layout is not None and schedule is not None:
-            hold = LayoutHold(photo, layout, keep_colours, schedule, self.scheduler.config.prediction_type)
         init = photo if init_strength < 1.0 else None
-        images = self._generate(settings, embeds, noise_level, prompts, report, init, hold)
+        wrap = None if hold is None else partial(hold.wrap, photo=photo)
+        images = self._generate(settings, embeds, noise_level, prompts, report, init, wrap)
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 
     def _mixed(
