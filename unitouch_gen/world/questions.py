@@ -23,7 +23,7 @@ QUESTIONS: dict[str, tuple[str, ...]] = {
 
 UNTOLD = 0.12  # share of the view in contact below which the material cannot be told
 PLACE = ("cover", "place x", "place y")
-ALL_OVER, CENTRED = 0.75, 0.2  # share above which contact is all over; distance, half views, of a contact in the centre
+ALL_OVER, CENTRED = 0.9, 0.12  # share above which contact is all over; distance, half views, of a contact in the centre
 
 
 def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[str, tuple[str, str]]]:
