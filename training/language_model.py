@@ -5,9 +5,9 @@ python -m unitouch_gen.training.language_model --output runs/language_model
 
 import json
 from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
 
 import torch
+import torch.nn.functional as F
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerBase, PreTrainedTokenizerFast
@@ -32,11 +32,17 @@ class LanguageModelRecipe(Recipe):
 
 
 class AnswerObjective(nn.Module):
-    """Cross-entropy of the answers' tokens: of a language model, or of a bridge into a frozen one."""
+    """Cross-entropy of the answers' tokens: of a language model, or of a bridge into a frozen one.
 
-    def __init__(self, language_model: LlamaForCausalLM, bridge: LanguageBridge | None = None):
+    Unit embeddings get a random vector of up to the length `noise`, so that a bridge that was trained on pictures'
+    takes those of touches, which lie beside them (Nukrai et al., 2022, "Text-Only Training for Image Captioning using
+    Noise-Injected CLIP").
+    """
+
+    def __init__(self, language_model: LlamaForCausalLM, bridge: LanguageBridge | None = None, noise: float = 0.0):
         super().__init__()
         self.language_model, self.bridge = language_model.requires_grad_(bridge is None), bridge
+        self.noise = noise
 
     @property
     def trained(self) -> nn.Module:
@@ -46,8 +52,13 @@ class AnswerObjective(nn.Module):
         rows = torch.arange(len(batch["input_ids"]))
         chosen = torch.randint(batch["input_ids"].shape[1], (len(rows),))  # one of the pairs (B, V, T) of each contact
         ids, labels = (batch[name][rows, chosen].long() for name in ("input_ids", "labels"))
-        bridge = self.bridge
-        with nullcontext() if bridge is None else bridge.attach(self.language_model, batch["image_embeds"]):
+        longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # what is behind it is padding
+        ids, labels = ids[:, :longest], labels[:, :longest]
+        if self.bridge is None:
+            return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
+        embeds = F.normalize(batch["image_embeds"].float(), dim=1)
+        embeds = embeds + self.noise * torch.rand(len(rows), 1) * F.normalize(torch.randn_like(embeds), dim=1)
+        with self.bridge.attach(self.language_model, embeds):
             return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
 
 

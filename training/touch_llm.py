@@ -6,6 +6,7 @@ python -m unitouch_gen.training.touch_llm --joint runs/image_text/model --llama 
 import shutil
 
 import torch
+from pydantic import NonNegativeFloat
 from transformers import AutoTokenizer, LlamaForCausalLM
 
 from unitouch_gen.models.language import LanguageBridge
@@ -17,6 +18,7 @@ from unitouch_gen.training.stages import Recipe, Stage, run
 
 class TouchLLMRecipe(Recipe):
     model: Arguments  # of `LanguageBridge.for_model`
+    noise: NonNegativeFloat  # of embeddings in training; see `AnswerObjective`
 
 
 def main(stage: Stage) -> None:
@@ -27,7 +29,7 @@ def main(stage: Stage) -> None:
     splits = stage.splits("image", "text")
     pairs = encoded(AutoTokenizer.from_pretrained(place), pairs_of(stage.sources, splits))
     dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **pairs)
-    stage.fit(AnswerObjective(llama, bridge), dataset)
+    stage.fit(AnswerObjective(llama, bridge, stage.recipe.noise), dataset)
     with stage.saving() as folder:
         bridge.save_pretrained(folder / "language_bridge")
         shutil.copytree(place, folder / "language_model")

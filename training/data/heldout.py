@@ -18,7 +18,8 @@ from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
-from unitouch_gen.world import SAMPLE_RATE
+from unitouch_gen.world import SAMPLE_RATE, World
+from unitouch_gen.world.questions import QUESTIONS, asked_of
 
 FIRST_SEED = 1000
 """Of the worlds that models are held against: beyond those that recipes train on."""
@@ -41,12 +42,13 @@ def world_contacts(
     if grasps:
         margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
         labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
+    attributes = torch.from_numpy(np.array(seen.attributes))
     return Contacts(
         seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
         image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds,
         relit=lambda: float_pixels(relit_pictures(source, split, seen.fingerprint, size, cache)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
-        attributes=torch.from_numpy(np.array(seen.attributes)),
+        attributes=attributes, asked=asked_of(World(source.seed).draw(*source.contacts(split)), attributes[:, 0]),
     )  # fmt: skip
 
 
@@ -57,10 +59,18 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     seen = decoded(cache, data, processor, ["touch", *gel, *modalities], data.materials)
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
+    told = {"caption": list(seen.text)} if "text" in modalities else {}
+    if "material" in labels and bool((labels["material"] >= 0).all()):
+        told["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
+    asked = [
+        {topic: (QUESTIONS[topic][0], [answers[row]]) for topic, answers in told.items()}
+        for row in range(len(data) if told else 0)
+    ]
     return Contacts(
         seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
         image=seen.image, audio=seen.audio, text=seen.text if "text" in modalities else (), gel=seen.background,
         sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None,
+        asked=asked,
     )  # fmt: skip
 
 

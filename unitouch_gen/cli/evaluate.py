@@ -28,8 +28,11 @@ TABLES = {
     "prompts": "Six ways to ask for a material (Table 7): zero-shot accuracy, %",
     "touch-to-image": "Pictures of touches (Table 5)",
     "x-to-touch": "Touches of pictures, captions, sounds and other touches (Section 4.8)",
+    "caption": "Answers about touches (Section 4.6): right, %",
 }
 GENERATED = ("touch-to-image", "x-to-touch")
+PIPELINES = {**{name: name for name in GENERATED}, "caption": "touch-to-text"}
+"""Tables of what pipelines make, and which ones."""
 
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
@@ -49,6 +52,7 @@ def evaluate(
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
+    judge: Annotated[Path | None, Option(help="Folder of a language model that rates captions from 1 to 5.")] = None,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False,
 ) -> None:  # fmt: skip
@@ -65,7 +69,7 @@ def evaluate(
         options.check_output([output / f"{name}.json" for name in names], overwrite)
     layout = layout_of(materials, pattern)
     folders = [open_dataset(folder, kind, sensor=sensor, bgr=bgr, **layout) for folder in data or ()]
-    pipes = {name: load_pipeline(name, model=model, device=device) for name in names if name in GENERATED}
+    pipes = {name: load_pipeline(PIPELINES[name], model=model, device=device) for name in names if name in PIPELINES}
     joint, processor = load_joint_space(model, device)
     for name in tuple(names):
         try:
@@ -82,7 +86,7 @@ def evaluate(
         else:
             known = [name for name in NAMED if name in joint.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
-        made, images = figures_of(names, sets, joint, processor, pipes, each)
+        made, images = figures_of(names, sets, joint, processor, pipes, each, judge)
     facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
     for name, rows in made.items():
         show(name, rows, facts, output, images.get(name))
@@ -95,12 +99,13 @@ def evaluate(
 
 def asked_for(table: str, model: str | None) -> list[str]:
     """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
-    drawn = {*GENERATED} if model is None else set[str]()
-    if model is not None and (table in GENERATED or (Path(model) / "model_index.json").is_file()):
-        drawn = {kind_of(model)}
-    if table in GENERATED and table not in drawn:
-        raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {', '.join(drawn)}; name one of {table}.")
-    return [name for name in TABLES if name == table or (table == "all" and name not in {*GENERATED} - drawn)]
+    made = {*PIPELINES} if model is None else set[str]()
+    if model is not None and (table in PIPELINES or (Path(model) / "model_index.json").is_file()):
+        kind = kind_of(model)
+        made = {name for name, pipeline in PIPELINES.items() if pipeline == kind}
+        if table in PIPELINES and table not in made:
+            raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {kind}; name one for {PIPELINES[table]}.")
+    return [name for name in TABLES if name == table or (table == "all" and name not in {*PIPELINES} - made)]
 
 
 def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
@@ -109,7 +114,8 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
 
     label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
-    asked = {"text"} if label else {"image"} if name == "touch-to-image" else {"image", "audio", "text"}
+    needed = {"touch-to-image": {"image"}, "caption": {"text"}}
+    asked = {"text"} if label else needed.get(name, {"image", "audio", "text"})
     usable = asked & {*joint.known_modalities}
     if "touch" not in joint.known_modalities or not usable:
         wanted = " or ".join(sorted(asked))
@@ -143,13 +149,20 @@ def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
 
 
 def figures_of(
-    names: Sequence[str], sets: "Sets", joint: "UniTouchModel", processor: Any, pipes: Mapping[str, Any], each: int
+    names: Sequence[str],
+    sets: "Sets",
+    joint: "UniTouchModel",
+    processor: Any,
+    pipes: Mapping[str, Any],
+    each: int,
+    judge: Path | None = None,
 ) -> tuple[dict[str, Figures], dict[str, Any]]:
     """Figures of each table, and images that were made for it."""
     import torch
 
     from unitouch_gen import weights
     from unitouch_gen.evaluation import generated, tables
+    from unitouch_gen.evaluation.answers import caption_table
     from unitouch_gen.evaluation.zero_shot import text_embeddings
     from unitouch_gen.models.classifier import ContactClassifier
 
@@ -169,6 +182,8 @@ def figures_of(
                 found = {row: {f"{sensor}, {domain}": share} for row, share in asking[name](splits, embed).items()}
             elif name == "retrieval":
                 found = tables.retrieval_table(splits)
+            elif name == "caption":
+                found = caption_table(pipes[name], splits, embed, each, judge)
             elif (name, domain, seed) not in drawn and all(
                 drawable(name, pipes[name], one) for one in splits["test"].sensors
             ):

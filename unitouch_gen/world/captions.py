@@ -33,6 +33,11 @@ ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.05, "slightly rough": 0.15, "ro
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
 """And the standard deviation of heights, mm, and the compliance, below which they are said."""
 
+DIRECTION_WORDS: tuple[str, ...] = tuple(
+    f"running {words}" for words in ("from side to side", "down to the right", "up and down", "up to the right")
+)
+"""At 0, 45, 90 and 135 degrees in the picture, whose y points down."""
+
 
 def described(draws: Draws, variant: int = 0) -> list[str]:
     """One sentence a contact; each variant is another one, as true of it."""
@@ -88,6 +93,5 @@ def word_below(words: dict[str, float], value: float) -> str:
 
 
 def direction_word(angle: float) -> str:
-    """For the direction of a grain in the picture, radians, whose y points down."""
-    words = ("from side to side", "down to the right", "up and down", "up to the right")
-    return "running " + words[round((angle % math.pi) / (math.pi / 4)) % 4]
+    """For the direction of a grain in the picture, radians."""
+    return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]

@@ -69,3 +69,15 @@ def place_answer(cover: float, x: float, y: float) -> str:
     if math.hypot(x, y) < CENTRED:
         return "in the centre."
     return ("to the left.", "to the right.")[x > 0] if abs(x) > abs(y) else ("above.", "below.")[y > 0]
+
+
+def asked_of(draws: Draws, attributes: Tensor, captions: int = 8) -> list[dict[str, tuple[str, list[str]]]]:
+    """A question of each contact and topic, and what is true of it: one answer, or several captions."""
+    found = [
+        {topic: (question, [answer]) for topic, (question, answer) in one.items()}
+        for one in answered(draws, attributes)
+    ]
+    for variant in range(1, captions):
+        for one, caption in zip(found, described(draws, variant), strict=True):
+            one["caption"][1].append(f"{caption}.")
+    return found

@@ -1,0 +1,85 @@
+"""Figures of answers about touches, on answers that are right or wrong by construction."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers.language import make_language_parts
+from unitouch_gen.evaluation.answers import attributes_of, caption_table, measured, rated
+from unitouch_gen.evaluation.contacts import Contacts
+from unitouch_gen.world import MATERIAL_NAMES, World
+from unitouch_gen.world.attributes import ATTRIBUTES
+from unitouch_gen.world.questions import asked_of
+
+OBJECTS = 6
+
+
+@pytest.fixture(scope="module")
+def contacts() -> Contacts:
+    """Of every material, whose touches, embeddings and attributes are their numbers."""
+    material, number = torch.cartesian_prod(torch.arange(len(MATERIAL_NAMES)), torch.arange(OBJECTS)).T
+    attributes = torch.zeros(len(material), len(ATTRIBUTES))
+    attributes[:, ATTRIBUTES.index("cover")] = torch.rand(len(material), generator=torch.Generator().manual_seed(0))
+    draws = World(0).draw(material, number, torch.zeros_like(number))
+    made = Contacts(
+        np.zeros((len(material), 3, 8, 8), np.uint8), [None] * len(material), number, {"material": material},
+        {"material": MATERIAL_NAMES}, asked=asked_of(draws, attributes),
+    )  # fmt: skip
+    made.features = {"touch": torch.eye(len(material)), "image": torch.eye(len(material))}
+    return made
+
+
+class Knowing:
+    """Answers what is true of the contact that a one-hot embedding names, or what is true of the first."""
+
+    def __init__(self, contacts: Contacts):
+        self.asked, self.read = contacts.asked, iter(torch.eye(len(contacts.asked)))
+
+    def encode_touch(self, pixels, sensors):
+        return torch.stack([next(self.read) for _ in range(len(pixels))])
+
+    def __call__(self, touch_embeds, question, **options):
+        known = [self.asked[int(row)] for row in touch_embeds.argmax(dim=1)]
+        rows = zip(known, question, strict=True)
+        return SimpleNamespace(
+            texts=[next(true[0] for asked, true in one.values() if asked == text) for one, text in rows]
+        )
+
+
+def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
+    for one in contacts.asked:  # all are asked the same
+        for topic, (_, answers) in one.items():
+            one[topic] = (topic, answers)
+    rows = caption_table(Knowing(contacts), {"train": contacts, "test": contacts}, lambda texts: torch.eye(102)[::6], 6)
+    assert rows["touch"] == rows["picture"] == pytest.approx(dict.fromkeys(rows["touch"], 1.0))
+    usual, shuffled = rows["most frequent answer"], rows["shuffled touches"]
+    assert usual["grasp"] == usual["hard or soft"] == 0.5 and usual["material"] < 0.1
+    assert shuffled["material"] < 0.2 and shuffled["contact place"] < 0.6 and shuffled["ROUGE-L"] < 1.0
+    assert rows["zero-shot classifier"] == {"material": pytest.approx(22 / 102)}  # a tie is the first one
+
+
+def test_a_class_that_is_rare_counts_as_much_as_others():
+    asked = [{"grasp": ("?", [answer])} for answer in ["yes, it would hold."] * 9 + ["no, it would slip."]]
+    assert measured(asked, {"grasp": ["it would hold."] * 10}, ())["grasp"] == 0.5
+    asked = [{"grain": ("?", [answer])} for answer in ("it is running up and down.", "it has no grain.")]
+    assert measured(asked, {"grain": ["it is running up and down."] * 2}, ())["grain"] == 1.0  # of what has one
+
+
+def test_attributes_are_whole_words():
+    assert attributes_of("slightly rough red irregular brick, a rod") == {
+        "slightly rough",
+        "irregular",
+        "brick",
+        "a rod",
+    }
+    assert attributes_of("a coarseness of bricks") == set()
+
+
+def test_a_language_model_rates_from_1_to_5(tmp_path):
+    parts = make_language_parts()
+    for name in ("language_model", "tokenizer"):
+        parts[name].save_pretrained(tmp_path)
+    ratings = rated(tmp_path, ["rough brick."] * 2, ["rough brick.", "a wet leaf."])
+    assert len(ratings) == 2 and all(1.0 < rating < 5.0 for rating in ratings)

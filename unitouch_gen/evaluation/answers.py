@@ -1,0 +1,143 @@
+"""Answers about touches (Section 4.6 of the paper): the share that is right, and how a language model rates them."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics.functional.text import rouge_score
+from transformers import AutoModelForCausalLM, AutoTokenizer
+
+from unitouch_gen.evaluation.contacts import Splits, float_pixels, in_batches
+from unitouch_gen.evaluation.controls import Figures, others
+from unitouch_gen.evaluation.generated import some
+from unitouch_gen.evaluation.metrics import cosines
+from unitouch_gen.evaluation.zero_shot import PROMPTS
+from unitouch_gen.world import MATERIALS
+from unitouch_gen.world.captions import DIRECTION_WORDS, HARDNESS_WORDS, ROUGHNESS_WORDS, SHAPE_WORDS
+
+Asked = Mapping[str, tuple[str, Sequence[str]]]
+"""By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
+
+TOLD: dict[str, dict[str, str]] = {
+    "place": {word: word for word in ("all over", "centre", "left", "right", "above", "below")},
+    "grain": {word: word for word in DIRECTION_WORDS},
+    "feel": {word: "hard" if word in ("hard", "firm") else "soft" for word in HARDNESS_WORDS},
+    "grasp": {"hold": "hold", "slip": "slip"},
+}
+"""By topic: words that tell answers apart, and what each stands for."""
+
+COLUMNS = {"material": "material", "place": "contact place", "grain": "grain", "feel": "hard or soft", "grasp": "grasp"}
+
+FELT = (
+    *ROUGHNESS_WORDS, *HARDNESS_WORDS, *DIRECTION_WORDS, "regular", "irregular", "fine", "coarse",
+    *(word for words in SHAPE_WORDS.values() for word in words),
+    *(word for material in MATERIALS for word in (material.name, *material.feel)),
+)  # fmt: skip
+"""What captions say that can be felt: all but colours."""
+
+RATING = Path(__file__).with_name("rating.txt")
+"""Asks for a number from 1 to 5 for {answer}, where {truth} is true."""
+
+
+def caption_table(
+    pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Tensor], each: int, judge: Path | None = None
+) -> dict[str, Figures]:
+    """Shares of answers that are right, of `each` contacts of every material of the split "test", by row.
+
+    Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of the material and
+    of the grain, where there is one, it is the accuracy; of the place, the hardness and a grasp it is balanced.
+    Attributes of captions are right if any true caption has them; ROUGE-L is that to the nearest of these.
+
+    Args:
+        pipe: A `TouchToTextPipeline`.
+        embed: Gives unit embeddings of texts, for the zero-shot classifier.
+        judge: Folder of a causal language model that rates captions from 1 to 5; see `rated`.
+    """
+    test, names = splits["test"], splits["test"].classes["material"]
+    rows = some(test, each)
+    asked = [test.asked[row] for row in rows.tolist()]
+    usual = {topic: Counter(one[topic][1][0] for one in splits["train"].asked) for topic in asked[0]}
+    pixels, known = float_pixels(test.touch[rows.numpy()]), [test.sensors[row] for row in rows.tolist()]
+    touch = in_batches(len(rows), lambda part: pipe.encode_touch(pixels[part], known[part]))
+    embeds = {"touch": touch, "shuffled touches": touch[others(len(touch))]}
+    if "image" in test.features:
+        embeds["picture"] = test.features["image"][rows]
+    answers = {
+        "most frequent answer": {topic: [found.most_common(1)[0][0]] * len(rows) for topic, found in usual.items()}
+    }
+    for row, values in embeds.items():
+        answers[row] = {topic: answered(pipe, values, [one[topic][0] for one in asked]) for topic in asked[0]}
+    figures = {row: measured(asked, found, names, judge) for row, found in answers.items()}
+    classes = embed([PROMPTS["touch"].format(name) for name in names])
+    found = cosines(test.features["touch"][rows], classes).argmax(dim=1)
+    figures["zero-shot classifier"] = {"material": float((found == test.material[rows]).double().mean())}
+    return figures
+
+
+def answered(pipe: Any, embeds: Tensor, questions: Sequence[str]) -> list[str]:
+    """The likeliest answers to a question about each of N embeddings (N, D)."""
+    parts = [slice(start, start + 64) for start in range(0, len(questions), 64)]
+    return [
+        text
+        for part in parts
+        for text in pipe(touch_embeds=embeds[part], question=list(questions[part]), do_sample=False).texts
+    ]
+
+
+def measured(
+    asked: Sequence[Asked], answers: Mapping[str, Sequence[str]], materials: Sequence[str], judge: Path | None = None
+) -> Figures:
+    """Figures of answers by topic, each to one of the questions that were asked."""
+    figures = Figures()
+    for topic, words in {"material": {name: name for name in materials}, **TOLD}.items():
+        if topic not in answers:
+            continue
+        pairs = [
+            (told(one[topic][1][0], words), told(text, words)) for one, text in zip(asked, answers[topic], strict=True)
+        ]
+        right = {true: [true == said for other, said in pairs if other == true] for true, _ in pairs if true}
+        shares = [sum(found) / len(found) for found in right.values()]
+        balanced = topic not in ("material", "grain")
+        count = sum(map(len, right.values()))
+        figures[COLUMNS[topic]] = sum(shares) / len(shares) if balanced else sum(map(sum, right.values())) / count
+    if "caption" in answers:
+        true = [list(one["caption"][1]) for one in asked]
+        shares = []
+        for references, text in zip(true, answers["caption"], strict=True):
+            said = attributes_of(text)
+            shares.append(len(said & attributes_of(" ".join(references))) / max(1, len(said)))
+        figures["caption's attributes"] = sum(shares) / len(shares)
+        scores = rouge_score(list(answers["caption"]), true, accumulate="best", rouge_keys="rougeL")
+        figures["ROUGE-L"] = float(scores["rougeL_fmeasure"])
+        if judge is not None:
+            figures["rating"] = sum(rated(judge, [one[0] for one in true], answers["caption"])) / len(true)
+    return figures
+
+
+def told(text: str, words: Mapping[str, str]) -> str | None:
+    """What the first of some words in a text stands for; `None` if there is none."""
+    found = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
+    return words[found[0]] if found else None
+
+
+def attributes_of(text: str) -> set[str]:
+    """The words of `FELT` in a text, the longest where one holds another."""
+    longest = "|".join(sorted(map(re.escape, FELT), key=len, reverse=True))
+    return set(re.findall(rf"\b(?:{longest})\b", text))
+
+
+@torch.no_grad()
+def rated(judge: Path, truths: Sequence[str], answers: Sequence[str]) -> list[float]:
+    """Ratings from 1, wrong, to 5 by a causal language model of a folder: the mean over its next token's digits."""
+    tokenizer = AutoTokenizer.from_pretrained(judge)
+    model = AutoModelForCausalLM.from_pretrained(judge, use_safetensors=True).eval()
+    digits, template, found = tokenizer.convert_tokens_to_ids(list("12345")), RATING.read_text(), list[float]()
+    for truth, answer in zip(truths, answers, strict=True):
+        ids = tokenizer(template.format(truth=truth, answer=answer), return_tensors="pt")["input_ids"]
+        shares = model(ids).logits[0, -1, digits].float().softmax(dim=0)
+        found.append(float(shares @ torch.arange(1.0, 6.0)))
+    return found
