@@ -11,7 +11,8 @@ ARGS ?=
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
-STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier
+STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier \
+	language_model touch_llm
 JOINT := --joint $(RUNS)/image_text/model
 # Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
 MODULE_captions := image_text
@@ -22,6 +23,8 @@ TAKES_audio := $(JOINT)
 TAKES_touch := $(JOINT) --init $(RUNS)/touch_pairs/model
 TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
 TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
+TAKES_language_model := $(JOINT)
+TAKES_touch_llm := $(JOINT) --llama $(RUNS)/language_model/model
 
 # Processes that keep the memory they free train and render in two thirds of the time (glibc).
 weights: export MALLOC_MMAP_THRESHOLD_ := 4000000000
@@ -68,11 +71,12 @@ $(RECORDS): $(RUNS)/%/record.json: | $(VENV)/.installed
 	$(BIN)/python -m unitouch_gen.training.$(or $(MODULE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
-$(foreach stage,audio touch_pairs touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(foreach stage,audio touch_pairs touch unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
 $(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
+$(RUNS)/touch_llm/record.json: | $(RUNS)/language_model/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
 	rm -rf build dist *.egg-info docs/_build outputs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -7,30 +7,35 @@ from typing import Any
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from transformers import AutoTokenizer, LlamaForCausalLM
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import as_path, read_settings, reading
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.base import UniTouchPipeline, autoencoder_in, check_filled, read_scheduler
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
+from unitouch_gen.pipelines.touch_to_text import TouchToTextPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
 PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
+    "touch-to-text": TouchToTextPipeline,
 }
+FOLDERS = {"stylization": "touch-to-image"}
+"""Of what only some pipelines have, where it is not the pipeline's name."""
 
 
 def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "x-to-touch" or "stylization".
+        name: "touch-to-image", "x-to-touch", "stylization" or "touch-to-text".
         dtype: dtype of the networks; the solver's state is always float32.
         family: Another folder of the same layout, such as one of your own training.
 
@@ -44,9 +49,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
     dtype, family = check_dtype("dtype", dtype), _family(family)
-    to_touch = kind is XToTouchPipeline
-    names = ("x-to-touch", "touch-vae") if to_touch else ("touch-to-image", "image-vae")
-    folder, vae = (family / place for place in names)
+    folder = family / FOLDERS.get(name, name)
 
     def stored(part: Any, place: Path) -> Any:
         made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
@@ -58,16 +61,23 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         parts: dict[str, Any] = {
             "unitouch": joint,
             "processor": processor,
-            "unet": stored(UNet2DConditionModel, folder / "unet"),
-            "scheduler": read_scheduler(folder / "scheduler"),
-            "vae": stored(autoencoder_in(vae), vae),
             **read_settings("family", folder / "defaults.json"),
         }
         if (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
-        if (folder / "backgrounds").is_dir():
+        if kind is TouchToTextPipeline:
+            language = folder / "language_model"
+            parts["language_model"] = stored(LlamaForCausalLM, language)
+            parts["language_bridge"] = stored(LanguageBridge, folder / "language_bridge")
+            parts["tokenizer"] = AutoTokenizer.from_pretrained(language)
+        else:
+            vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
+            parts["vae"] = stored(autoencoder_in(vae), vae)
+            parts["unet"] = stored(UNet2DConditionModel, folder / "unet")
+            parts["scheduler"] = read_scheduler(folder / "scheduler")
+        if kind is XToTouchPipeline and (folder / "backgrounds").is_dir():
             parts["backgrounds"] = stored(SensorBackgrounds, folder / "backgrounds")
-        if not to_touch:
+        if kind in (TouchToImagePipeline, TactileStylizationPipeline):
             joint.load("text")  # its transformer is also the unCLIP's text encoder
             parts |= {
                 "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
@@ -102,6 +112,7 @@ SHOWN = {  # caption of a model card's picture; what its figures measure
     "touch-to-image": ("Unseen touches, and below each the picture generated from it, of invented colours.", "picture"),
     "stylization": ("Photos, touches of other materials, and the photos restyled by them.", "photo"),
     "x-to-touch": ("Photos of unseen objects, and below each the touch generated from it.", "touch"),
+    "touch-to-text": ("", "answer"),
 }
 
 
@@ -125,5 +136,5 @@ def _card(family: Path, name: str) -> Card:
         "recording of a real sensor.",
         license="apache-2.0",
         limits="It is small and knows a procedural world; of real touches it says little.",
-        pictures={caption: weights.CARDS / f"{name}.jpg"},
+        pictures={caption: weights.CARDS / f"{name}.jpg"} if caption else {},
     )

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
+from unitouch_gen.training.language_model import PROMPT
 from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
@@ -99,6 +100,8 @@ def assemble(
         sensors = json.loads((ldm / "sensors.json").read_text())
         write_generator(ldm, place / "x-to-touch", {"sensors": sensors, **X_TO_TOUCH})
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
+        half_folder(models["touch_llm"], place / "touch-to-text")
+        write_json({"prompt_template": PROMPT}, place / "touch-to-text" / "defaults.json")
         write_json({"training": records, "figures": {}}, place / "family.json")
 
 

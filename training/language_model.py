@@ -1,22 +1,28 @@
 """The tiny family's language model: a LLaMA with a tokenizer of its own, from nothing, on what the world can be asked.
 
-python -m unitouch_gen.training.language_model --output runs/language_model
+It is so small, and reads so little, that a bridge into one that was trained on words alone hardly moves it. So it is
+trained with a bridge from pictures' embeddings, which is left: `touch_llm` trains another, with the model frozen.
+
+python -m unitouch_gen.training.language_model --joint runs/image_text/model --output runs/language_model
 """
 
 import json
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
+from pydantic import NonNegativeFloat
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerBase, PreTrainedTokenizerFast
 
 from unitouch_gen.errors import check_integer
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source
-from unitouch_gen.training.recipe import Arguments, build
+from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.world import World
 from unitouch_gen.world.questions import QUESTIONS, answered
@@ -26,27 +32,35 @@ VARIANTS = 3  # of the wording of each topic
 Pairs = list[tuple[str, str]]
 
 
+class AnswerSettings(Settings):
+    """What `AnswerObjective` does to embeddings."""
+
+    noise: NonNegativeFloat  # greatest length of what is added to unit embeddings
+
+
 class LanguageModelRecipe(Recipe):
     tokenizer: Arguments
     model: Arguments
+    bridge: Arguments  # of `LanguageBridge.for_model`, which is trained beside it and left
+    objective: AnswerSettings
 
 
 class AnswerObjective(nn.Module):
-    """Cross-entropy of the answers' tokens: of a language model, or of a bridge into a frozen one.
+    """Cross-entropy of the answers' tokens of a bridge into a language model, which is frozen or is trained with it.
 
     Unit embeddings get a random vector of up to the length `noise`, so that a bridge that was trained on pictures'
     takes those of touches, which lie beside them (Nukrai et al., 2022, "Text-Only Training for Image Captioning using
     Noise-Injected CLIP").
     """
 
-    def __init__(self, language_model: LlamaForCausalLM, bridge: LanguageBridge | None = None, noise: float = 0.0):
+    def __init__(self, language_model: LlamaForCausalLM, bridge: LanguageBridge, noise: float, frozen: bool):
         super().__init__()
-        self.language_model, self.bridge = language_model.requires_grad_(bridge is None), bridge
-        self.noise = noise
+        self.language_model, self.bridge = language_model.requires_grad_(not frozen), bridge
+        self.noise, self.frozen = noise, frozen
 
     @property
     def trained(self) -> nn.Module:
-        return self.bridge or self.language_model
+        return self.bridge if self.frozen else self
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         rows = torch.arange(len(batch["input_ids"]))
@@ -54,8 +68,6 @@ class AnswerObjective(nn.Module):
         ids, labels = (batch[name][rows, chosen].long() for name in ("input_ids", "labels"))
         longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # what is behind it is padding
         ids, labels = ids[:, :longest], labels[:, :longest]
-        if self.bridge is None:
-            return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
         embeds = F.normalize(batch["image_embeds"].float(), dim=1)
         embeds = embeds + self.noise * torch.rand(len(rows), 1) * F.normalize(torch.randn_like(embeds), dim=1)
         with self.bridge.attach(self.language_model, embeds):
@@ -108,15 +120,23 @@ def train_language_tokenizer(texts: Iterable[str], vocab_size: int) -> PreTraine
 def main(stage: Stage) -> None:
     recipe: LanguageModelRecipe = stage.recipe
     build("tokenizer", train_language_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
-    pairs = pairs_of(stage.sources, stage.splits("text"))
+    joint, splits = stage.joint_space("image"), stage.splits("image", "text")
+    pairs = pairs_of(stage.sources, splits)
     texts = (text for one in pairs for pair in one for text in pair)
     tokenizer = build("tokenizer", train_language_tokenizer, recipe.tokenizer, texts=texts)
     special = {"vocab_size": len(tokenizer), "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
     model = LlamaForCausalLM(build("model", LlamaConfig, recipe.model, **special))
-    stage.fit(AnswerObjective(model), ArrayDataset(**encoded(tokenizer, pairs)))
+    bridge = build_bridge("bridge", recipe.bridge, model, joint)
+    dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **encoded(tokenizer, pairs))
+    stage.fit(AnswerObjective(model, bridge, recipe.objective.noise, frozen=False), dataset)
     with stage.saving() as folder:
         model.save_pretrained(folder)
         tokenizer.save_pretrained(folder)
+
+
+def build_bridge(section: str, arguments: Arguments, language_model: LlamaForCausalLM, joint: UniTouchModel) -> Any:
+    given = {"language_model": language_model, "embedding_dim": joint.config.projection_dim}
+    return build(section, LanguageBridge.for_model, arguments, **given)
 
 
 if __name__ == "__main__":

@@ -43,14 +43,10 @@ STAGES: dict[str, dict[str, str]] = {
     "touch_vae": {},
     "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
     "touch_classifier": {},
-}
-"""All stages in order. Each names the options that take an earlier stage's output, and that stage."""
-
-OPTIONAL_STAGES: dict[str, dict[str, str]] = {
-    "language_model": {},
+    "language_model": {"joint": "image_text"},
     "touch_llm": {"joint": "image_text", "llama": "language_model"},
 }
-"""Stages of models that a family has not yet."""
+"""All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
@@ -102,7 +98,7 @@ class Stage:
         self.trainer, self.data = self.recipe.trainer, self.recipe.data
         folders = {"joint": joint, "vae": vae, "llama": llama, "init": init}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        needs = {*(STAGES | OPTIONAL_STAGES)[name]}
+        needs = {*STAGES[name]}
         if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
             wanted = command_of(name, Path("runs"))
@@ -213,7 +209,7 @@ class Stage:
 
 def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in (STAGES | OPTIONAL_STAGES)[name].items()]
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
     return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 

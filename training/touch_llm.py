@@ -6,30 +6,27 @@ python -m unitouch_gen.training.touch_llm --joint runs/image_text/model --llama 
 import shutil
 
 import torch
-from pydantic import NonNegativeFloat
 from transformers import AutoTokenizer, LlamaForCausalLM
 
-from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.batches import ArrayDataset
-from unitouch_gen.training.language_model import AnswerObjective, encoded, pairs_of
-from unitouch_gen.training.recipe import Arguments, build
+from unitouch_gen.training.language_model import AnswerObjective, AnswerSettings, build_bridge, encoded, pairs_of
+from unitouch_gen.training.recipe import Arguments
 from unitouch_gen.training.stages import Recipe, Stage, run
 
 
 class TouchLLMRecipe(Recipe):
     model: Arguments  # of `LanguageBridge.for_model`
-    noise: NonNegativeFloat  # of embeddings in training; see `AnswerObjective`
+    objective: AnswerSettings
 
 
 def main(stage: Stage) -> None:
     joint, place = stage.joint_space("image"), stage.folders["llama"]
     llama = LlamaForCausalLM.from_pretrained(place, dtype=torch.float32, use_safetensors=True)
-    given = {"language_model": llama, "embedding_dim": joint.config.projection_dim}
-    bridge = build("model", LanguageBridge.for_model, stage.recipe.model, **given)
+    bridge = build_bridge("model", stage.recipe.model, llama, joint)
     splits = stage.splits("image", "text")
     pairs = encoded(AutoTokenizer.from_pretrained(place), pairs_of(stage.sources, splits))
     dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **pairs)
-    stage.fit(AnswerObjective(llama, bridge, stage.recipe.noise), dataset)
+    stage.fit(AnswerObjective(llama, bridge, stage.recipe.objective.noise, frozen=True), dataset)
     with stage.saving() as folder:
         bridge.save_pretrained(folder / "language_bridge")
         shutil.copytree(place, folder / "language_model")

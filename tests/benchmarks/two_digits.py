@@ -19,8 +19,24 @@ from tests.benchmarks.joint_space import JointSpace
 from tests.benchmarks.measuring import Figures
 from unitouch_gen import weights
 from unitouch_gen.evaluation.controls import statistics, untrained_like
+from unitouch_gen.models import UniTouchModel
 
 UNITS = ("D20118", "D20140")
+AVERAGED = ("touch encoder", "untrained 0")  # over views, of which there are forty
+
+
+def views(pixels: torch.Tensor, side: float = 0.75) -> list[torch.Tensor]:
+    """Touches (N, 3, S, S) as they are and their four corners, each in the eight ways a square can be laid.
+
+    An embedding says where and which way round a contact lies; the mean of these says less of that, and so more of what
+    was touched.
+    """
+    size = pixels.shape[-1]
+    part = round(side * size)
+    corners = [pixels[..., y : y + part, x : x + part] for y in (0, size - part) for x in (0, size - part)]
+    shown = [pixels, *(F.interpolate(corner, size=(size, size), mode="bilinear") for corner in corners)]
+    turned = [torch.rot90(one, turn, (-2, -1)) for one in shown for turn in range(4)]
+    return [view for one in turned for view in (one, one.flip(-1))]
 
 
 @torch.no_grad()
@@ -34,9 +50,10 @@ def two_digits(joint: JointSpace, archive: Path) -> Figures:
         archive: `digit_touchtouch.zip`, whose index.csv names file, unit and object of each image.
 
     Returns:
-        By encoder, the area under the ROC curve of same-object pairs against others ("auc", mean over objects, and its
-        standard error "spread"), and the share of images whose nearest of the other unit is of the same object
-        ("nearest"). Objects filmed on another day (`hdmi_*`, `usb_*`) are left out.
+        By encoder, of touches as they are and of the mean over `views`, the area under the ROC curve of same-object
+        pairs against others ("auc", mean over objects, and its standard error "spread"), and the share of images whose
+        nearest of the other unit is of the same object ("nearest"). Objects filmed on another day (`hdmi_*`, `usb_*`)
+        are left out.
     """
     with zipfile.ZipFile(archive) as box:
         index = list(csv.DictReader(io.TextIOWrapper(box.open("index.csv"))))
@@ -49,13 +66,24 @@ def two_digits(joint: JointSpace, archive: Path) -> Figures:
     changes = [(128.0 * (one - mean[unit])).movedim(0, -1).numpy() for one, unit in pairs]
     models = {"touch encoder": joint.models["touch"]}
     models |= {f"untrained {seed}": untrained_like(joint.models["touch"], seed) for seed in range(3)}
-    features = {
-        name: torch.cat([model.get_touch_features(part) for part in pixels.split(128)]).double().numpy()
-        for name, model in models.items()
-    }
-    features["statistics"] = np.log1p(np.abs(found := statistics(changes))) * np.sign(found)
+    features = dict[str, np.ndarray]()
+    for name, model in models.items():
+        found = [F.normalize(encoded(model, view), dim=1) for view in (views(pixels) if name in AVERAGED else [pixels])]
+        features[name] = found[0].double().numpy()
+        if len(found) > 1:
+            features[f"{name}, mean of views"] = torch.stack(found).mean(dim=0).double().numpy()
+    plain = [
+        statistics(list(view.movedim(1, -1).numpy()))
+        for view in views(torch.from_numpy(np.stack(changes)).movedim(-1, 1))
+    ]
+    for name, values in {"statistics": plain[0], "statistics, mean of views": np.mean(plain, axis=0)}.items():
+        features[name] = np.log1p(np.abs(values)) * np.sign(values)
     features["8 x 8 pixels"] = F.adaptive_avg_pool2d(pixels, 8).flatten(1).double().numpy()
     return {name: _known_again(values, objects, first) for name, values in features.items()}
+
+
+def encoded(model: UniTouchModel, pixels: torch.Tensor) -> torch.Tensor:
+    return torch.cat([model.get_touch_features(part) for part in pixels.split(128)])
 
 
 def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -> dict[str, float]:

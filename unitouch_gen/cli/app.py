@@ -20,7 +20,7 @@ def app(
     dtype: options.Dtype = None,
     device: options.Device = "auto",
 ) -> None:
-    """Serves a page: touch to picture, photos restyled by a touch, and anything to touch.
+    """Serves a page: touch to picture, photos restyled by a touch, anything to touch, and answers.
 
     Needs the extra `app`.
 
@@ -30,7 +30,7 @@ def app(
         socket.create_server((host, port)).close()
     except (OSError, UnicodeError) as error:
         raise InvalidInputError(f"`--port` {port} cannot be served at {host!r}: {error}; name another.") from error
-    models = {kind_of(one): one for one in model} if model else dict.fromkeys(CLASSES)
+    models = {kind_of(one, [*CLASSES]): one for one in model} if model else dict.fromkeys(CLASSES)
     with tempfile.TemporaryDirectory(prefix="unitouch-") as folder:
         os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
         needed("gradio", "app")

@@ -13,7 +13,7 @@ from unitouch_gen.errors import InvalidInputError
 def ask(
     touch: Annotated[str, Argument(help=f"Touch images, or videos: {options.SEVERAL}.")],
     question: Annotated[str, Argument(help="What to ask about each.")],
-    model: Annotated[str, Option(help=f"{options.A_FOLDER} a saved TouchToTextPipeline.")],
+    model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a saved pipeline; or built-in.")] = None,
     stream: Annotated[bool, Option("--stream", metavar="", help="Print words as they are found.")] = False,
     max_new_tokens: Annotated[int | None, Option(min=1, help="Of an answer; the model's own if left out.")] = None,
     sensor: options.Sensor = None, seed: options.Seed = 0, dtype: options.Dtype = None,
@@ -21,7 +21,7 @@ def ask(
 ) -> None:  # fmt: skip
     """Answers a question about each touch.
 
-    Example: unitouch-gen ask example:brick "How does it feel?" --model touch-llm
+    Example: unitouch-gen ask example:brick "How does it feel?"
     """
     if stream and as_json:
         raise InvalidInputError("`--stream` prints words as they come, which is no JSON; leave out one of them.")

@@ -13,7 +13,7 @@ from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, files_in, load_pipeline, suffixes_of
+from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, first_line
 
@@ -29,7 +29,7 @@ def batch(
     context: Context,
     source: Annotated[Path, Argument(help="A .csv or .jsonl with a line for each picture, or a folder.")],
     output: Annotated[Path, Option("--output", "-o", help="A folder; pictures that are there stay.")],
-    pipeline: Annotated[str, Option(help=f"{', '.join(CLASSES)}.")] = "touch-to-image",
+    pipeline: Annotated[str, Option(help=f"{', '.join(DRAWING)}.")] = "touch-to-image",
     num_inference_steps: options.Steps = None,
     settings: Annotated[list[str] | None, Option("--set", help="A column of lines without: sensor=digit.")] = None,
     seed: options.Seed = 0, batch_size: options.BatchSize = 8, model: options.Model = None,
@@ -41,7 +41,7 @@ def batch(
 
     Example: unitouch-gen batch touches/ -o pictures/
     """
-    check_choice("--pipeline", pipeline, CLASSES)
+    check_choice("--pipeline", pipeline, DRAWING)
     rows = in_folder(source, pipeline, output) if source.is_dir() else in_list(source)
     import torch
     from accelerate import PartialState

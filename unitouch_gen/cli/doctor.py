@@ -9,7 +9,7 @@ from typer import echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, INPUTS, device_of, kind_of, load_pipeline
+from unitouch_gen.cli.loading import DRAWING, INPUTS, device_of, kind_of, load_pipeline
 
 
 def doctor(model: options.Model = None, dtype: options.Dtype = None, device: options.Device = "auto") -> None:
@@ -19,7 +19,7 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
     """
     from unitouch_gen.weights import FAMILY
 
-    costs = [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else CLASSES)]
+    costs = [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else DRAWING)]
     options.print_table(["package", "installed"], packages())
     echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
     echo(f"Built-in weights: {FAMILY}. Runs on {device_of(device)}")

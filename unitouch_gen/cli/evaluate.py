@@ -13,7 +13,7 @@ from typer import Argument, Option, echo
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.data import BGR, Materials, Pattern, layout_of
-from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
+from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def asked_for(table: str, model: str | None) -> list[str]:
     """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
     made = {*PIPELINES} if model is None else set[str]()
     if model is not None and (table in PIPELINES or (Path(model) / "model_index.json").is_file()):
-        kind = kind_of(model)
+        kind = kind_of(model, [*CLASSES])
         made = {name for name, pipeline in PIPELINES.items() if pipeline == kind}
         if table in PIPELINES and table not in made:
             raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {kind}; name one for {PIPELINES[table]}.")

@@ -21,11 +21,12 @@ CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
     "x-to-touch": "XToTouchPipeline",
     "stylization": "TactileStylizationPipeline",
+    "touch-to-text": "TouchToTextPipeline",
 }
 """Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
 
-ANSWERING = {"touch-to-text": "TouchToTextPipeline"}
-"""The same of one that draws nothing, and is not built in."""
+DRAWING = ("touch-to-image", "x-to-touch", "stylization")
+"""Those that make images."""
 
 INPUTS = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
 """What pipelines are given of a contact to be measured on."""
@@ -87,7 +88,7 @@ def load_pipeline(
     name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu",
     load_sensor: Sequence[Path] | None = None, quiet: bool = True, **_others: Any,
 ) -> Any:  # fmt: skip
-    """A pipeline, one of `CLASSES` or `ANSWERING`, by a command's options: of a folder or repository, or built in."""
+    """A pipeline, one of `CLASSES`, by a command's options: of a folder or repository, or built in."""
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
     import torch
@@ -110,7 +111,7 @@ def load_pipeline(
     else:
         folder = folder_of(model)
         with reading("--model", model):
-            pipe = getattr(pipelines, (CLASSES | ANSWERING)[name]).from_pretrained(folder, dtype=weights_dtype)
+            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=weights_dtype)
     for file in load_sensor or ():
         pipe.load_sensor(file)
     pipe.set_progress_bar_config(disable=quiet)
@@ -143,16 +144,16 @@ def folder_of(model: str) -> Path:
     return local_folder("--model", model)
 
 
-def kind_of(model: str) -> str:
-    """The name among `CLASSES` of a saved pipeline."""
+def kind_of(model: str, kinds: Sequence[str] = DRAWING) -> str:
+    """The name of a saved pipeline, which has to be one of some kinds among `CLASSES`."""
     from unitouch_gen.files import read_settings
 
     name = read_settings("--model", folder_of(model) / "model_index.json").get("_class_name")
     name = name[-1] if isinstance(name, list) and name else name  # [module, class] on the Hub
-    if name not in CLASSES.values():
-        known = ", ".join(CLASSES.values())
-        raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {known}.")
-    return next(kind for kind, known in CLASSES.items() if known == name)
+    known = {CLASSES[kind]: kind for kind in kinds}
+    if name not in known:
+        raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(known)}.")
+    return known[name]
 
 
 def device_of(name: str) -> Any:

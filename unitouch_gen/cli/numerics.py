@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from typer import Exit, Option, echo
 
-from unitouch_gen.cli.loading import CLASSES, INPUTS, kind_of, load_pipeline
+from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, check_output, print_table
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
 
@@ -14,7 +14,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_number, d
 def work_precision(
     output: Annotated[Path, Option("--output", "-o", help="A folder for the chart and the results.")],
     problem: Annotated[str | None, Option(help="An exact problem, such as mixture-7.5.")] = None,
-    pipeline: Annotated[str | None, Option(help=f"{', '.join(CLASSES)}.")] = None,
+    pipeline: Annotated[str | None, Option(help=f"{', '.join(DRAWING)}.")] = None,
     model: Model = None,
     solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
@@ -47,7 +47,7 @@ def work_precision(
     if problem is not None:
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
-        name = check_choice("--pipeline", pipeline, CLASSES)
+        name = check_choice("--pipeline", pipeline, DRAWING)
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
         target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale)
         if "default" in names:
@@ -93,7 +93,7 @@ def stability(
     def load(kind: str, dtype: Any) -> Any:
         return load_pipeline(kind, model=model, dtype=str(dtype).removeprefix("torch."))
 
-    known = {case.name: case for case in cases(load, [*CLASSES] if model is None else [kind_of(model)])}
+    known = {case.name: case for case in cases(load, [*DRAWING] if model is None else [kind_of(model)])}
     if only is not None and only not in known:
         raise InvalidInputError(f"Unknown case {only!r}; --list shows them. {did_you_mean(only, known)}".rstrip())
     table = [*known.values()] if only is None else [known[only]]

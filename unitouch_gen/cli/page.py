@@ -1,7 +1,8 @@
 """The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
 
 import random
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline
 
 def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
     """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it asks no other host."""
-    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch"}
+    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch",
+              "touch-to-text": "Ask"}  # fmt: skip
     fields = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields}
     # Uploads and pictures stay on the disk for an hour.
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
@@ -25,7 +27,10 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
         with gradio.Tabs():
             for kind in [kind for kind in titles if kind in pipes]:
                 with gradio.Tab(titles[kind]):
-                    tab(pipes[kind], fields[kind], kind == "touch-to-image")
+                    if kind == "touch-to-text":
+                        asking_tab(pipes[kind])
+                    else:
+                        tab(pipes[kind], fields[kind], kind == "touch-to-image")
     system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
     css = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"  # phones
     page.queue(max_size=16, default_concurrency_limit=1).launch(
@@ -54,6 +59,30 @@ def tab(pipe: Any, make_fields: Any, names_touches: bool) -> None:
         return answer(pipe, {name: given[part] for name, part in fields.items()}, progress)
 
     button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
+
+
+def asking_tab(pipe: Any) -> None:
+    """The tab of a pipeline that answers questions."""
+    with gradio.Row():
+        with gradio.Column():
+            touch = upload("touch", "Touch")
+            asked = [
+                "What is it made of?",
+                "How does it feel?",
+                "Where is the contact?",
+                "Which way does the grain run?",
+            ]
+            question = gradio.Dropdown(asked, value=asked[1], label="Question", allow_custom_value=True)
+            button = gradio.Button("Ask", variant="primary")
+        with gradio.Column():
+            results = [gradio.Textbox(label="Answer"), gradio.Textbox(label="Run report", lines=2)]
+
+    def run(touch: str | None, question: str) -> tuple[str, str]:
+        with refusing([touch or ""]):
+            output = pipe(touch, question)
+        return output.texts[0], str(output.report)
+
+    button.click(run, [touch, question], results, concurrency_id="pipelines", api_visibility="private")
 
 
 # Fields ---------------------------------------------------------------------------------------------------------------
@@ -132,16 +161,23 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
         progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
         return {}
 
-    try:
+    with refusing(value for value in given.values() if isinstance(value, str)):
         generator = [torch.Generator().manual_seed(seed + number) for number in range(count)]
         output = pipe(**given, generator=generator, callback_on_step_end=show)
-    except (ValueError, TypeError, ArithmeticError) as error:
-        said = first_line(error)
-        for value in filter(lambda value: isinstance(value, str), given.values()):
-            said = said.replace(value, Path(value).name)  # names of uploads, and not where they lie here
-        raise gradio.Error(said, duration=None, print_exception=False) from error
     felt = ""
     if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier.name(output.encoded[:1], "touch")[0])
     return output.images, felt, str(output.report), str(seed)
+
+
+@contextmanager
+def refusing(uploads: Iterable[str]) -> Iterator[None]:
+    """Tells in the page what a call refuses, with the names of uploads, and not where they lie here."""
+    try:
+        yield
+    except (ValueError, TypeError, ArithmeticError) as error:
+        said = first_line(error)
+        for value in filter(None, uploads):
+            said = said.replace(value, Path(value).name)
+        raise gradio.Error(said, duration=None, print_exception=False) from error

@@ -1,8 +1,8 @@
 """The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
 
 Layout: `joint/` is the space of all four modalities with its processor, `embedding-bank/` embeddings of pictures that
-those of other modalities are moved towards, `image-vae/` the autoencoder of pictures, `touch-to-image/` what only
-unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only that pipeline has.
+those of other modalities are moved towards, `image-vae/` the autoencoder of pictures, `touch-vae/` that of touch
+images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only pipelines of this kind have.
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
 model cards, and `family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
 """
@@ -10,19 +10,12 @@ model cards, and `family.json` holds the figures, seeds, times and recipes. Ever
 from pathlib import Path
 
 FAMILY = Path(__file__).parent
-JOINT, EMBEDDING_BANK, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
-    FAMILY / name
-    for name in (
-        "joint",
-        "embedding-bank",
-        "image-vae",
-        "touch-to-image",
-        "picture-classifier",
-        "touch-vae",
-        "x-to-touch",
-        "touch-classifier",
-    )
+JOINT, EMBEDDING_BANK = FAMILY / "joint", FAMILY / "embedding-bank"
+IMAGE_VAE, TOUCH_VAE = FAMILY / "image-vae", FAMILY / "touch-vae"
+TOUCH_TO_IMAGE, X_TO_TOUCH, TOUCH_TO_TEXT = (
+    FAMILY / name for name in ("touch-to-image", "x-to-touch", "touch-to-text")
 )
+PICTURE_CLASSIFIER, TOUCH_CLASSIFIER = FAMILY / "picture-classifier", FAMILY / "touch-classifier"
 FIGURES = FAMILY / "family.json"
 CARDS = FAMILY / "cards"
 """A picture for each pipeline, which `samples/card_pictures.py` draws."""
