@@ -10,7 +10,6 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
@@ -30,7 +29,6 @@ from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, c
 from unitouch_gen.training.recipe import Arguments, build
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
-from unitouch_gen.training.watching import pixels_of, retrieval
 
 
 class ImageTextSettings(AttributeSettings):
@@ -111,13 +109,6 @@ def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
     ]  # fmt: skip
 
 
-def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, heldout: list[Rendered]) -> dict[str, float]:
-    """Retrieval of captions by pictures."""
-    input_ids = processor.text([caption for split in heldout for caption in split.text])["input_ids"]
-    image = model.get_image_features(pixels_of(heldout, "image", model.device))
-    return retrieval(image, model.get_text_features(input_ids.to(model.device)))
-
-
 def main(stage: Stage) -> None:
     recipe: ImageTextRecipe = stage.recipe
     init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
@@ -145,8 +136,7 @@ def main(stage: Stage) -> None:
     if recipe.sampler.group > 1:
         sampler = stage.sampler(recipe.sampler, splits, stage.image_embeddings(model, splits))
     trained = ImageTextObjective(model, objective)
-    watch = stage.watching(partial(watch_retrieval, model, processor), "image", "text")
-    stage.fit(trained, ArrayDataset(**data), sampler, watch)
+    stage.fit(trained, ArrayDataset(**data), sampler)
 
     embeddings = stage.image_embeddings(model, splits).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings[near > 0], axis=1).mean())

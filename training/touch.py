@@ -3,7 +3,6 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,14 +21,12 @@ from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
-from unitouch_gen.training.watching import pixels_of, retrieval
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
 
 class TouchAugmentation(Settings):
-    """Probabilities of turning and mirroring, exchanging colours, and softening: other lights and gels."""
+    """Probabilities of exchanging colours, and of softening: other lights and gels."""
 
-    turn: Share
     permute: Share
     blur: Share
 
@@ -128,8 +125,8 @@ class TouchObjective(nn.Module):
 
     def augmented(self, touch: Tensor) -> Tensor:
         """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
-        raw = batches.turn_and_flip(batches.shift_pixels(touch.float() / 255, 4), self.augment.turn)
-        raw = batches.blur_some(batches.permute_channels(raw, self.augment.permute), self.augment.blur)
+        raw = batches.permute_channels(batches.shift_pixels(touch.float() / 255, 4), self.augment.permute)
+        raw = batches.blur_some(raw, self.augment.blur)
         return normalise_pixels(batches.add_noise(batches.jitter_colours(raw, gain=0.15, offset=0.08), 0.02))
 
 
@@ -175,13 +172,6 @@ def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
     }
 
 
-def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, heldout: list[Rendered]) -> dict[str, float]:
-    """Retrieval of pictures by touches."""
-    sensors, device = torch.from_numpy(sensor_numbers(heldout, model.config.sensors)), encoder.bank.tokens.device
-    touch, _ = encoder(pixels_of(heldout, "touch", device), sensors.to(device))
-    return retrieval(touch, model.get_image_features(pixels_of(heldout, "image")))
-
-
 def main(stage: Stage) -> None:
     recipe: TouchRecipe = stage.recipe
     stage.check_drawn(*recipe.objective.pairs)
@@ -205,8 +195,7 @@ def main(stage: Stage) -> None:
         **(pairs_of(splits) if recipe.objective.pairs else {}),
     )
     objective = TouchObjective(model, recipe.augment, recipe.objective)
-    watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")
-    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds), watch)
+    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
     with stage.saving() as folder:
         save_modalities(model, ("touch",), stage.processor, folder)
 

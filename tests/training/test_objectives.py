@@ -31,7 +31,7 @@ UNCLIP = unclip.UnclipSettings(
 )
 DIFFUSION = touch_ldm.TouchDiffusionSettings(condition_dropout=0.0, noisy_share=0.0, condition_noise=0.0, snr_gamma=5.0)
 PLAIN = AutoencoderLoss(gradient_weight=0.0, latent_noise=0.0, latent_weight=0.0)
-STILL = TouchAugmentation(turn=0.0, permute=0.0, blur=0.0)
+STILL = TouchAugmentation(permute=0.0, blur=0.0)
 PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.uint8)
 EMBEDS = 2.0 + torch.randn(COUNT, WIDTH, generator=torch.Generator().manual_seed(1))
 
