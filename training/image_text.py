@@ -22,8 +22,8 @@ from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source, shown
+from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.data.drawn import DrawnGrasps
-from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import Arguments, build
@@ -104,7 +104,7 @@ def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
     """Pictures under another lamp; those of grasps, which have none, as they are."""
     return [
         split.image if isinstance(source, DrawnGrasps)
-        else relit_pictures(source, "train", split.fingerprint, stage.processor.image_size, stage.cache)  # type: ignore[arg-type]
+        else relit(stage.cache, source, "train", split)  # type: ignore[arg-type]
         for source, split in zip(stage.sources, splits, strict=True)
     ]  # fmt: skip
 

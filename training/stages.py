@@ -219,14 +219,15 @@ def save_modalities(
 ) -> None:
     """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
     config = deepcopy(model.config)
-    for name in ("ood_thresholds", "temperatures", "sensor_reaches"):
-        setattr(config, name, {})  # they were measured of other weights
+    measured = ("temperatures",) if "touch" in modalities else ("temperatures", "ood_thresholds", "sensor_reaches")
+    for name in measured:
+        setattr(config, name, {})  # of other weights
     config.save_pretrained(folder)
     processor.save_pretrained(folder)
     state = {
         f"{name}.{key}": tensor.detach().contiguous().clone()
         for modality in modalities
-        for name in MODULES[modality]
+        for name in (*MODULES[modality], *(["out_of_distribution"] if modality == "touch" else []))
         for key, tensor in getattr(model, name).state_dict().items()
     }
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})

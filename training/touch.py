@@ -15,7 +15,9 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
+from unitouch_gen.training.abstention import ABSTAINED, fit_distance, spread
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
 from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
@@ -151,8 +153,10 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
             model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
 
 
-def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
-    """Each sensor's prototype: the mean of all raw images it took in training."""
+def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
+    """Each sensor's prototype: the mean of all raw images it took in training. Their reach, if it is asked for, holds
+    all but a few of these: an encoder that has seen touches without tokens can do without them beyond it."""
+    model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
         chunks = (part[start : start + 1024] for part in parts for start in range(0, len(part), 1024))
@@ -160,6 +164,10 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         mean = total / sum(len(part) for part in parts) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
+        if reaches:
+            own = torch.from_numpy(np.concatenate([spread(part) for part in parts])) / 255
+            distances = layout_distances(own, model.sensor_bank.prototype(name))
+            model.config.sensor_reaches[name] = distances.quantile(1.0 - ABSTAINED / 2).item()
 
 
 def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
@@ -185,7 +193,7 @@ def main(stage: Stage) -> None:
     model.add("touch")
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
-    set_prototypes(model, splits)
+    set_prototypes(model, splits, reaches=bool(recipe.objective.pairs))
 
     dataset = ArrayDataset(
         image_embeds=embeds,
@@ -196,6 +204,7 @@ def main(stage: Stage) -> None:
     )
     objective = TouchObjective(model, recipe.augment, recipe.objective)
     stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
+    fit_distance(model, splits)
     with stage.saving() as folder:
         save_modalities(model, ("touch",), stage.processor, folder)
 

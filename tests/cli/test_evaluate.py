@@ -68,7 +68,6 @@ REFUSED = [  # words of a command, what is changed in the labels, and what is sa
     (("taste",), None, "`table` is 'taste'"),
     (("material", "--data", "nowhere"), None, "nowhere"),
     (("material", "--seeds", "0"), None, "'--seeds'"),
-    (("material", "--pattern", "touch"), None, "`--pattern`"),
     (("touch-to-image",), None, "a pipeline for x-to-touch"),
     (("material", "--model", "in"), None, "holds no config.json"),
     (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),

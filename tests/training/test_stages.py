@@ -27,7 +27,7 @@ from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import MATERIAL_NAMES, World
 
 SHORT = (
-    "data.drawn={sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1, held_out: 1}", "trainer.steps=2",
+    "data.drawn={sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=2",
     "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2",
 )  # fmt: skip
 ALONE = ("data.image_size=32", f"data.audio={json.dumps(AUDIO)}")

@@ -5,8 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,22 +36,12 @@ class SetConfig(Settings):
     split: SplitBy | None = None
     sensor: str | None = None
     materials: list[str] | None = None
-    bgr: bool = False
     sampling_rate: PositiveInt | None = None
-    patterns: dict[str, str] | None = None
 
-    def read(self, split: str) -> list[RecordSet]:
-        """The records of a split, a part for each sensor."""
+    def read(self) -> list[RecordSet]:
+        """The records to train on, a part for each sensor."""
         data = open_dataset(self.path, **self.model_dump(exclude={"path", "split"}))
-        return data.split(split, self.split).by_sensor()
-
-    def held_out(self, count: int) -> list[RecordSet]:
-        """At most `count` records of each sensor that are not in the training split; none where all train."""
-        for split in ("val", "test") if self.split != "none" else ():
-            with suppress(InvalidInputError):  # it has no such split
-                parts = [part.thinned(count) for part in self.read(split)]
-                return [part for part in parts if len(part) > 1]
-        return []
+        return data.split("train", self.split).by_sensor()
 
 
 class DataConfig(Settings):
@@ -73,12 +62,7 @@ class DataConfig(Settings):
                 "which `grasps` are."
             )
         drawn = self.drawn.sources(self.grasps) if self.drawn else []
-        return [*drawn, *(part for one in self.sets for part in one.read("train"))]
-
-    def held_out(self, count: int) -> list[Source]:
-        """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        drawn = self.drawn.sources(self.grasps) if self.drawn else []
-        return [*drawn, *(part for one in self.sets for part in one.held_out(count))]
+        return [*drawn, *(part for one in self.sets for part in one.read())]
 
 
 @dataclass
@@ -100,12 +84,6 @@ class Rendered:
     def __len__(self) -> int:
         return len(self.material)
 
-    def thinned(self, count: int) -> "Rendered":
-        """At most `count` of its samples, spread over all, in memory."""
-        rows = np.unique(np.linspace(0, len(self) - 1, count).astype(int))
-        columns = {name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
-        return replace(self, **columns, text=[self.text[row] for row in rows])
-
 
 def has(record: Record, need: str) -> bool:
     """Whether a record has a column that a stage may need: touch, image, background, audio, text, material, sensor."""
@@ -120,12 +98,11 @@ def columns_of(
     config: DataConfig,
     processor: UniTouchProcessor,
     needs: Sequence[str],
-    split: str = "train",
 ) -> list[Rendered]:
-    """The columns of each source, rendered or decoded if the cache does not hold them yet.
+    """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
-    `needs` are those of `has`; other columns of data sets stay empty. `split` is of drawn contacts: data sets hold the
-    records of theirs. Raises `InvalidInputError` if a data set lacks what is needed, or files cannot be read.
+    `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
+    what is needed, or files cannot be read.
     """
     for data in (source for source in sources if isinstance(source, RecordSet)):
         lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if not has(r, need)]
@@ -138,7 +115,7 @@ def columns_of(
     return [
         decoded(cache, source, processor, needs, names, config.touch_size)
         if isinstance(source, RecordSet)
-        else drawn(cache, source, split, processor)
+        else drawn(cache, source, "train", processor)
         for source in sources
     ]
 
@@ -175,6 +152,19 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
         )
     text = json.loads((folder / "text.json").read_text())
     return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
+
+
+def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.ndarray:
+    """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), once into the cache."""
+
+    def write(arrays: Arrays, _: Path) -> None:
+        done = 0
+        for pictures in tqdm(source.relit(split, seen.image.shape[-1]), f"{source.name}, relit", mininterval=5):
+            arrays["image"][done : done + len(pictures)] = as_bytes(pictures)
+            done += len(pictures)
+
+    folder = Path(cache) / f"{source.name}-{split}-relit-{seen.fingerprint}"
+    return mapped(folder, len(seen), {"image": (np.uint8, *seen.image.shape[1:])}, write)["image"]
 
 
 def decoded(

@@ -19,12 +19,21 @@ from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, World
 from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.gel import untouched_gel
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
 from unitouch_gen.world.sensors import draw_sensor
 
 GROUP = 16
 """Contacts to a pair of sensors."""
+
+
+class Relit(World):
+    """The same contacts under other lamps."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
+        draws = super().draw(material, object_, contact)
+        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ class DrawnContacts:
     objects: int
     contacts_per_object: int
     seed: int = 0
-    held_out: int = 16
+    held_out: int = 16  # objects of the other splits
 
     materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
     kind: ClassVar[str] = "drawn"
@@ -89,6 +98,12 @@ class DrawnContacts:
         pairs = [self.pair(split, group) for group in groups]
         return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
 
+    def relit(self, split: str, size: int) -> Iterator[Tensor]:
+        """Pictures (n, 3, S, S) of the scenes, each under the lamp and white balance of the next contact."""
+        world = Relit(self.seed, image_size=size)
+        for names in zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True):
+            yield world.render(*names, modalities=("image",)).image  # type: ignore[misc]
+
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
         draws = World(self.seed).draw(*self.contacts(split))
@@ -134,7 +149,6 @@ class DrawnConfig(Settings):
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
     seed: NonNegativeInt = 0  # of the world
-    held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16  # objects to validate on
 
     def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
         """One for each sensor, and behind them one for each sensor that grasps are felt by."""

@@ -12,7 +12,7 @@ from typer import Argument, Option, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.data import BGR, Materials, Pattern, layout_of
+from unitouch_gen.cli.data import Materials, names_of
 from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
 
@@ -45,7 +45,7 @@ def evaluate(
     data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
     kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
     sensor: Annotated[str | None, Option(help="Sensor of all touches of the data sets.")] = None,
-    materials: Materials = None, pattern: Pattern = None, bgr: BGR = False,
+    materials: Materials = None,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
@@ -63,8 +63,8 @@ def evaluate(
 
     if output is not None:
         options.check_output([output / f"{name}.json" for name in names], overwrite)
-    layout = layout_of(materials, pattern)
-    folders = [open_dataset(folder, kind, sensor=sensor, bgr=bgr, **layout) for folder in data or ()]
+    labels = names_of(materials)
+    folders = [open_dataset(folder, kind, sensor=sensor, materials=labels) for folder in data or ()]
     pipes = {name: load_pipeline(name, model=model, device=device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     for name in tuple(names):
