@@ -19,7 +19,7 @@ from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.abstention import ABSTAINED, fit_distance, spread
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
-from unitouch_gen.training.data import Rendered, sensor_numbers, shown
+from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
@@ -42,8 +42,7 @@ class LossWeights(Settings):
 
     image: NonNegativeFloat = 1.0  # InfoNCE of touches and their pictures (Eq. 2-3)
     # 1 - cosine(touch, picture). InfoNCE asks only that others are further, and leaves touches far from all pictures
-    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing. Grasps have none: their pictures show
-    # what came of them.
+    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing.
     cosine: NonNegativeFloat = 0.0
     touch: NonNegativeFloat = 0.0  # InfoNCE of the same contact under two sensors
     attributes: NonNegativeFloat = 0.0  # squared error of a contact's measures, read linearly off its embedding
@@ -107,14 +106,14 @@ class TouchObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         trained, weights = self.trained, self.weights
         touch, patches = trained(self.augmented(batch["touch"]), batch["sensor"])
-        picture, near = batch["image_embeds"], batch["shown"]
+        picture = batch["image_embeds"]
         parts = {"image": symmetric_info_nce(touch, picture, self.temperature)}
-        parts["cosine"] = cosine_distance(touch, picture, near)
+        parts["cosine"] = cosine_distance(touch, picture)
         if weights.pairs:
             unnamed = torch.full_like(batch["sensor"], -1)
             second, other_patches = trained(self.augmented(batch["second"]), unnamed)
             parts["image"] = 0.5 * (parts["image"] + symmetric_info_nce(second, picture, self.temperature))
-            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture, near)
+            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture)
             parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
             if trained.reader is not None:
                 read = trained.reader(torch.stack([touch, second], dim=1).float())
@@ -132,9 +131,9 @@ class TouchObjective(nn.Module):
         return normalise_pixels(batches.add_noise(batches.jitter_colours(raw, gain=0.15, offset=0.08), 0.02))
 
 
-def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """1 - cosine of embeddings (B, D), each weighed (B,); the mean over all of them."""
-    return (weight * (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1))).mean()
+def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
+    """The mean of 1 - cosine of embeddings (B, D)."""
+    return (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1)).mean()
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
@@ -198,7 +197,6 @@ def main(stage: Stage) -> None:
     dataset = ArrayDataset(
         image_embeds=embeds,
         sensor=sensor_numbers(splits, model.config.sensors),
-        shown=shown(stage.sources, splits),
         touch=[split.touch for split in splits],
         **(pairs_of(splits) if recipe.objective.pairs else {}),
     )

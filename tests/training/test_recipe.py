@@ -82,11 +82,11 @@ def test_an_override_takes_the_kind_of_value_it_looks_like_and_leaves_the_rest()
 
 
 def test_data_of_a_recipe_is_laid_over_its_base_and_sets_stand_in_for_what_that_draws(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text("{image_size: 16, touch_size: 3, drawn: {sensors: [digit]}, grasps: [null]}")
+    (tmp_path / "base.yaml").write_text("{image_size: 16, touch_size: 3, drawn: {sensors: [digit]}}")
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"data: {{base: {tmp_path / 'base.yaml'}, touch_size: 4}}")
     based = {"image_size": 16, "touch_size": 4}
-    drawn = {"drawn": {"sensors": ["digit"]}, "grasps": [None]}
+    drawn = {"drawn": {"sensors": ["digit"]}}
     sets = {"sets": [{"path": "a"}]}
     assert read_recipe(mine)["data"] == based | drawn
     assert read_recipe(mine, ["data.sets=[{path: a}]"])["data"] == based | sets

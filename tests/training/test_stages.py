@@ -110,7 +110,7 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
     config = json.loads((began / "config.json").read_text())
     (began / "config.json").write_text(json.dumps({**config, "temperatures": {"image": 0.2}}))
     (tmp_path / "run" / "record.json").write_text('{"seed": 3}')
-    changed = ("--set", "objective.views=0", "--set", "data.grasps=[digit]")
+    changed = ("--set", "objective.views=0")
     stage(runs, "image_text", "--init", str(began), *changed, output="kept")
     made = UniTouchModel.from_pretrained(runs / "kept" / "model")
     assert made.config.temperatures == {} and made.config.embedding_norm > 0
@@ -202,7 +202,7 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
         ("touch_vae", "--set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
-        ("touch", "--joint {joint} --set data.drawn.sensors=[digit] --set data.grasps=[]", "`sampler.sigma` is 0.75"),
+        ("touch", "--joint {joint} --set data.drawn.sensors=[digit]", "`sampler.sigma` is 0.75"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
     ):

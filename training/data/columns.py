@@ -19,7 +19,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, SensorName
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.records import Record, few
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
@@ -49,19 +49,17 @@ class DataConfig(Settings):
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None  # contacts of the world
-    grasps: list[SensorName] = []  # sensors that feel such contacts as grasps, with pictures of what comes of these
     image_size: int | None = None  # side of the pictures, pixels, where no joint space says it
     touch_size: Annotated[int, Field(ge=8)] | None = None  # side of the touches, pixels; `image_size` if left out
     audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
     def sources(self) -> list[Source]:
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
-        if self.drawn is None and (self.grasps or not self.sets):
+        if self.drawn is None and not self.sets:
             raise InvalidInputError(
-                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts, of "
-                "which `grasps` are."
+                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts."
             )
-        drawn = self.drawn.sources(self.grasps) if self.drawn else []
+        drawn = self.drawn.sources() if self.drawn else []
         return [*drawn, *(part for one in self.sets for part in one.read())]
 
 
@@ -236,12 +234,6 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     """A record's sound as processors take it: its file, or samples and their rate."""
     file = str(record.sound)
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
-
-
-def shown(sources: Sequence[Source], splits: Sequence[Rendered]) -> np.ndarray:
-    """1 for each sample whose picture shows what is touched, and 0 for grasps, whose shows what came of it, (N,)."""
-    near = [float(not isinstance(source, DrawnGrasps)) for source in sources]
-    return np.repeat(np.array(near, dtype=np.float32), [len(split) for split in splits])
 
 
 def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:
