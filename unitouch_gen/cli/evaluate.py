@@ -82,10 +82,10 @@ def evaluate(
         else:
             known = [name for name in NAMED if name in joint.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
-        made, images = figures_of(names, sets, joint, processor, pipes, each)
+        made = figures_of(names, sets, joint, processor, pipes, each)
     facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
     for name, rows in made.items():
-        show(name, rows, facts, output, images.get(name))
+        show(name, rows, facts, output)
     if output is not None:
         echo(f"The tables are in {output.resolve()}")
 
@@ -144,8 +144,8 @@ def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
 
 def figures_of(
     names: Sequence[str], sets: "Sets", joint: "UniTouchModel", processor: Any, pipes: Mapping[str, Any], each: int
-) -> tuple[dict[str, Figures], dict[str, Any]]:
-    """Figures of each table, and images that were made for it."""
+) -> dict[str, Figures]:
+    """Figures of each table."""
     import torch
 
     from unitouch_gen import weights
@@ -161,7 +161,7 @@ def figures_of(
     asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
     drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     made: dict[str, Figures] = {name: {} for name in names}
-    images, drawn = dict[str, Any](), set[tuple[str, str, int]]()
+    drawn = set[tuple[str, str, int]]()
     for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
         for name in names:
@@ -173,23 +173,18 @@ def figures_of(
                 drawable(name, pipes[name], one) for one in splits["test"].sensors
             ):
                 drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
-                found, shown = drawing[name](pipes[name], splits, judges, each, seed)
-                images.setdefault(name, shown)
+                found = drawing[name](pipes[name], splits, judges, each, seed)
             else:
                 continue
             for row, values in found.items():
                 columns = made[name].setdefault(row if name in asking else f"{row}, {domain}", {})
                 for column, value in values.items():
                     columns.setdefault(column, []).append(value)
-    return made, images
+    return made
 
 
-def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None, images: Any) -> None:
-    """Prints a table, and writes NAME.json, NAME.md and a grid NAME.png of images."""
-    from diffusers.utils import make_image_grid, numpy_to_pil
-    from torch import stack
-    from torch.nn.functional import interpolate
-
+def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None) -> None:
+    """Prints a table, and writes NAME.json and NAME.md."""
     from unitouch_gen.files import write_file
 
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
@@ -207,9 +202,4 @@ def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None
     write_file("--output", output / f"{name}.json", json.dumps({"table": name, "rows": rows, **facts}, indent=2) + "\n")
     cells = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
     page = [f"## {TABLES[name]}", "", *cells, "", f"Means over worlds, in brackets their spread. {facts}"]
-    if images:
-        tiles = stack([interpolate(part[:12].float(), (128, 128)) for part in images.values()], dim=1)
-        grid = make_image_grid(numpy_to_pil(tiles.flatten(0, 1).movedim(1, -1).numpy()), *tiles.shape[:2])
-        grid.save(output / f"{name}.png")
-        page += ["", f"From left to right: {', '.join(images)}.", "", f"![examples]({name}.png)"]
     write_file("--output", output / f"{name}.md", "\n".join(page) + "\n")

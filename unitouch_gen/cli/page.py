@@ -1,6 +1,5 @@
 """The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
 
-import random
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -37,26 +36,29 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
 
 def tab(pipe: Any, make_fields: Any, names_touches: bool) -> None:
     """The tab of a pipeline."""
+    steps, guidance = pipe.config.default_num_inference_steps, pipe.config.default_guidance_scale
     with gradio.Row():
         with gradio.Column():
-            fields = make_fields(pipe) | solver_fields(pipe)
+            fields: Fields = make_fields(pipe)
+            with gradio.Accordion("Solver, seed, number of pictures", open=False):
+                fields |= {
+                    "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
+                    "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
+                    "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
+                    "seed": gradio.Number(0, precision=0, minimum=0, label="Seed"),
+                }
             button = gradio.Button("Make it", variant="primary")
         with gradio.Column():
             results = [
                 gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
                 gradio.Textbox(label="Feels like", visible=names_touches),
                 gradio.Textbox(label="Run report", lines=3),
-                gradio.Textbox(label="Seed that was used"),
             ]
-    bar = gradio.Progress()
 
-    def run(given: dict[Any, Any], progress: gradio.Progress = bar) -> tuple[Any, ...]:
-        return answer(pipe, {name: given[part] for name, part in fields.items()}, progress)
+    def run(given: dict[Any, Any]) -> tuple[Any, ...]:
+        return answer(pipe, {name: given[part] for name, part in fields.items()})
 
     button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
-
-
-# Fields ---------------------------------------------------------------------------------------------------------------
 
 
 def touch_fields(pipe: Any) -> Fields:
@@ -74,7 +76,6 @@ def style_fields(pipe: Any) -> Fields:
         **touch_fields(pipe),
         "touch_weight": gradio.Slider(0, 1, 0.7, step=0.05, label="Share of the touch in the mix"),
         "layout": gradio.Slider(2, 16, 12, step=1, label="How finely the photo's layout is held"),
-        "keep_colours": gradio.Checkbox(False, label="Hold its mean colour, too"),
     }
 
 
@@ -87,7 +88,6 @@ def any_fields(pipe: Any) -> Fields:
         "audio": upload("audio", "Sound"),
         "touch": upload("touch", "Touch"),
         "sensor": gradio.Dropdown(sensors, value=sensors[0] if sensors else None, label="Sensor to draw for"),
-        "num_candidates": gradio.Slider(1, 8, 1, step=1, label="Candidates", info="Made of each; the best is kept."),
     }
 
 
@@ -104,37 +104,12 @@ def upload(modality: str, label: str) -> Any:
     return part
 
 
-def solver_fields(pipe: Any) -> Fields:
-    """Fields of all tabs."""
-    steps, guidance = pipe.config.default_num_inference_steps, pipe.config.default_guidance_scale
-    with gradio.Accordion("Solver, seed, number of pictures", open=False):
-        return {
-            "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
-            "tolerance": gradio.Number(None, label="Error of the latents, in place of steps", minimum=1e-3, maximum=1),
-            "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
-            "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
-            "seed": gradio.Number(0, precision=0, minimum=0, label="Seed; a new one each time if empty"),
-        }
-
-
-# Answers --------------------------------------------------------------------------------------------------------------
-
-
-def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
-    """Pictures, what they feel like, the run report and the seed; what the call refuses is told in the page."""
+def answer(pipe: Any, given: dict[str, Any]) -> tuple[Any, ...]:
+    """Pictures, what they feel like and the run report; what the call refuses is told in the page."""
     given = {name: value for name, value in given.items() if value not in (None, "")}
-    seed = int(given.pop("seed", random.randrange(2**31)))
-    if "tolerance" in given:
-        del given["num_inference_steps"]
-    count = given["num_images_per_prompt"] * given.get("num_candidates", 1)
-
-    def show(view: Any, step: int, timestep: Any, tensors: Any) -> dict[str, Any]:
-        progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
-        return {}
-
+    seed, count = int(given.pop("seed", 0)), given["num_images_per_prompt"]
     try:
-        generator = [torch.Generator().manual_seed(seed + number) for number in range(count)]
-        output = pipe(**given, generator=generator, callback_on_step_end=show)
+        output = pipe(**given, generator=[torch.Generator().manual_seed(seed + number) for number in range(count)])
     except (ValueError, TypeError, ArithmeticError) as error:
         said = first_line(error)
         for value in filter(lambda value: isinstance(value, str), given.values()):
@@ -144,4 +119,4 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
     if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier.name(output.encoded[:1], "touch")[0])
-    return output.images, felt, str(output.report), str(seed)
+    return output.images, felt, str(output.report)
