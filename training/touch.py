@@ -153,8 +153,11 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
 
 
 def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
-    """Each sensor's prototype: the mean of all raw images it took in training. Their reach, if it is asked for, holds
-    all but a few of these: an encoder that has seen touches without tokens can do without them beyond it."""
+    """Each sensor's prototype: the mean of all raw images it took in training.
+
+    With `reaches`, also the distance that all but a few of these are within. An encoder that has seen touches without
+    tokens can do without them beyond it.
+    """
     model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
