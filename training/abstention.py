@@ -1,46 +1,24 @@
-"""Fits what a joint space does not know: which touches are unlike those of its training, and how sure its names are.
+"""Which touches are unlike those that a touch encoder was trained on, by a distance that `touch` fits at its end."""
 
-    python -m unitouch_gen.training.abstention --joint runs/family/joint --cache runs/cache
-
-Statistics are of what it was trained on, temperatures and the threshold of what was held out. No weight changes.
-"""
-
-import math
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from safetensors import safe_open
-from scipy.optimize import minimize_scalar
 from torch import Tensor
-from typer import Option
 
-from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
-from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance
-from unitouch_gen.models.sensors import layout_distances
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, material_names
-from unitouch_gen.training.recipe import read, read_recipe
-from unitouch_gen.training.stages import run_command
+from unitouch_gen.training.data import Rendered
 from unitouch_gen.world import ATTRIBUTES
 
-Splits = Sequence[Rendered]
+ABSTAINED = 0.046
+"""Share of the touches of training that are beyond the threshold."""
 
 
-def inputs_of(splits: Splits, modality: str, processor: UniTouchProcessor) -> Iterator[Tensor]:
-    """What the encoder of a modality takes, 256 samples at a time."""
-    for split in splits:
-        for start in range(0, len(split), 256):
-            part = getattr(split, modality)[start : start + 256]
-            if modality == "text":
-                yield processor.text(part)["input_ids"]
-            else:
-                values = torch.from_numpy(np.array(part)).float()
-                yield values[:, None] if modality == "audio" else normalise_pixels(values / 255)
+def spread(values: np.ndarray, count: int = 500) -> np.ndarray:
+    """At most `count` rows, spread over all."""
+    return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))]
 
 
 def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> Gaussians:
@@ -58,79 +36,19 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
     return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
 
 
-def fit_temperature(scores: Tensor, labels: Tensor) -> float:
-    """Temperature of the softmax of scores (N, C) with the least negative log-likelihood (Guo et al., 2017)."""
+def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
+    """Gives a model the distance of touches, by class where materials are known, and its threshold."""
 
-    def loss(log_temperature: float) -> float:
-        return F.cross_entropy(scores.double() / math.exp(log_temperature), labels).item()
+    def statistics(images: Iterable[np.ndarray]) -> Tensor:
+        pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
+        parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
+        return torch.cat([model.get_touch_statistics(part).cpu() for part in parts])
 
-    return math.exp(minimize_scalar(loss, bounds=(-12.0, 12.0), method="bounded").x)
-
-
-def fit_distance(model: UniTouchModel, processor: UniTouchProcessor, train: Splits, held: Splits, share: float) -> None:
-    """Fits the distance of touches, and the threshold that a share of held-out touches is beyond."""
-
-    def statistics(splits: Splits, column: str) -> Tensor:
-        return torch.cat([model.get_touch_statistics(part) for part in inputs_of(splits, column, processor)]).cpu()
-
-    def pressed(splits: Splits) -> Tensor:
-        """Whether anything presses into the gel of each touch, as far as it is known, (N,)."""
-        cover = ATTRIBUTES.index("cover")
-        known = [np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover] for one in splits]
-        return torch.from_numpy(np.concatenate(known)) > 0.0
-
-    rows, materials = pressed(train), torch.from_numpy(np.concatenate([split.material for split in train]))
-    known, pictures = fit_gaussians(statistics(train, "touch")[rows], materials[rows]), statistics(train, "image")
-    distance = RelativeDistance(known, fit_gaussians(pictures, torch.zeros(len(pictures))))
-    far = distance(statistics(held, "touch")[pressed(held)])
+    cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
+    pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]
+    rows = torch.from_numpy(np.concatenate(pressed)) > 0.0
+    materials = torch.from_numpy(np.concatenate([spread(split.material) for split in splits]))[rows]
+    touches, pictures = statistics(split.touch for split in splits)[rows], statistics(split.image for split in splits)
+    distance = RelativeDistance(fit_gaussians(touches, materials), fit_gaussians(pictures, torch.zeros(len(pictures))))
     model.out_of_distribution["touch"] = distance
-    model.config.ood_thresholds = {"touch": {"foreign": far.quantile(1.0 - share).item()}}
-
-
-def fit_reaches(model: UniTouchModel, held: Splits, share: float) -> None:
-    """Fits how far each sensor's own touches lie from its prototype: all but a share of those that were held out."""
-    _, bank = model.load("touch")
-    for name in {split.sensor for split in held} & {*bank.names}:
-        own = torch.from_numpy(np.concatenate([split.touch for split in held if split.sensor == name])) / 255
-        reach = layout_distances(own, bank.prototype(name).float()).quantile(1.0 - share).item()
-        model.config.sensor_reaches = {**model.config.sensor_reaches, name: reach}
-    bank.reaches = dict(model.config.sensor_reaches)
-
-
-@torch.no_grad()
-def fit_temperatures(model: UniTouchModel, processor: UniTouchProcessor, held: Splits, names: Sequence[str]) -> None:
-    """Fits a temperature of each modality."""
-    labels, model.config.temperatures = torch.from_numpy(np.concatenate([split.material for split in held])), {}
-    classifier = ZeroShotTouchClassifier(model, processor)
-    for modality in MODALITIES:
-        encode = getattr(model, f"get_{modality}_features")
-        embeds = torch.cat([encode(part).float().cpu() for part in inputs_of(held, modality, processor)])
-        model.config.temperatures[modality] = fit_temperature(classifier.scores(embeds, modality, names), labels)
-
-
-def abstention(
-    *,
-    joint: Annotated[Path, Option(help="Folder of the joint space, such as `joint` of a family; it is written to.")],
-    recipe: Annotated[str, Option(help="Its `data` is fitted to.")] = "touch",
-    overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
-    share: Annotated[float, Option(min=0.001, max=0.5, help="Share of known touches on which it abstains.")] = 0.046,
-    cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
-) -> None:
-    """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
-    data = read(DataConfig, read_recipe(recipe, overrides or ()).get("data"), "data")
-    model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
-    needs, sources, most = (*MODALITIES, "material"), data.sources(), 500  # samples of each source and split
-    train = columns_of(sources, cache, data, processor, needs)
-    held = columns_of(data.held_out(most), cache, data, processor, needs, "val")
-    train, held = ([one.thinned(min(most, len(one))) for one in splits] for splits in (train, held))
-    fit_distance(model, processor, train, held, share)
-    if data.drawn is not None:  # an encoder that has seen touches without a sensor's tokens
-        fit_reaches(model, held, share / 2)
-    fit_temperatures(model, processor, held, material_names(sources))
-    with safe_open(next(joint.glob("model*.safetensors")), framework="pt") as stored:
-        dtype = stored.get_tensor(next(key for key in stored.keys() if key.endswith("weight"))).dtype  # noqa: SIM118
-    model.to(dtype).save_pretrained(joint)  # type: ignore[arg-type]
-
-
-if __name__ == "__main__":
-    run_command("abstention", abstention)
+    model.config.ood_thresholds = {"touch": {"foreign": distance(touches).quantile(1.0 - ABSTAINED).item()}}

@@ -3,18 +3,13 @@
 python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
 """
 
-from functools import partial
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
-from unitouch_gen.training.watching import pixels_of, retrieval
 
 
 class AudioObjective(nn.Module):
@@ -38,19 +33,12 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def watch_retrieval(model: UniTouchModel, heldout: list[Rendered]) -> dict[str, float]:
-    """Retrieval of pictures by sounds."""
-    sounds = torch.from_numpy(np.concatenate([split.audio for split in heldout])).float()
-    device = next(model.audio_model.parameters()).device
-    return retrieval(model.audio_model(sounds.to(device)), model.get_image_features(pixels_of(heldout, "image")))
-
-
 def main(stage: Stage) -> None:
     model = stage.joint_space("image")
     splits = stage.splits("image", "audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=stage.image_embeddings(model, splits))
     model.add("audio")
-    stage.fit(AudioObjective(model), dataset, watch=stage.watching(partial(watch_retrieval, model), "image", "audio"))
+    stage.fit(AudioObjective(model), dataset)
     with stage.saving() as folder:
         save_modalities(model, ("audio",), stage.processor, folder)
 

@@ -141,19 +141,6 @@ def jitter_colours(images: Tensor, gain: float, offset: float) -> Tensor:
     return (images * (1.0 + gain * scale) + offset * shift).clamp(0.0, 1.0)
 
 
-def turn_and_flip(images: Tensor, probability: float) -> Tensor:
-    """Turns some images by a multiple of 90 degrees and mirrors half of those: lights from other sides."""
-    chosen = torch.rand(len(images), device=images.device) < probability
-    quarter = torch.randint(0, 4, (len(images),), device=images.device) * chosen
-    mirrored = (torch.rand(len(images), device=images.device) < 0.5) & chosen
-    out = images.clone()
-    for turns in (1, 2, 3):
-        rows = quarter == turns
-        out[rows] = torch.rot90(images[rows], turns, dims=(2, 3))
-    out[mirrored] = out[mirrored].flip(3)
-    return out
-
-
 def permute_channels(images: Tensor, probability: float) -> Tensor:
     """Exchanges the colours of some images: lights of other colours."""
     chosen = torch.rand(len(images), device=images.device) < probability

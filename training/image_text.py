@@ -10,27 +10,25 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
-from unitouch_gen.training.data import DrawnContacts, Rendered, Source, shown
-from unitouch_gen.training.data.drawn import DrawnGrasps
-from unitouch_gen.training.data.relit import relit_pictures
+from unitouch_gen.training.data import DrawnContacts, Rendered, Source
+from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import Arguments, build
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
-from unitouch_gen.training.watching import pixels_of, retrieval
 
 
 class ImageTextSettings(AttributeSettings):
@@ -71,13 +69,12 @@ class ImageTextObjective(nn.Module):
         rows = torch.arange(len(captions))
         text = self.model.get_text_features(captions[rows, torch.randint(captions.shape[1], (len(captions),))])
         temperature = 1.0 / self.log_scale.exp().clamp(max=100.0)
-        parts, near = {"text": symmetric_info_nce(image, text, temperature)}, batch["shown"]
+        parts = {"text": symmetric_info_nce(image, text, temperature)}
         if self.settings.views:
             second = self.model.get_image_features(normalise_pixels(recoloured(batch["relit"].float() / 255)))
             parts["views"] = symmetric_info_nce(image, second, self.model.config.temperature)
         if self.reader is not None:
-            error = (self.reader(image.float()) - batch["attributes"]).square().mean(dim=1)
-            parts["attributes"] = (near * error).mean()
+            parts["attributes"] = F.mse_loss(self.reader(image.float()), batch["attributes"])
         loss = torch.stack([getattr(self.settings, name, 1.0) * part for name, part in parts.items()]).sum()
         told = {"temperature": temperature, **parts}
         return {"loss": loss, **{name: value.detach() for name, value in told.items()}}
@@ -96,26 +93,16 @@ def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -
     captions = list[list[str]]()
     for source, split in zip(sources, splits, strict=True):
         if isinstance(source, DrawnContacts):
-            captions += source.captions("train", count, split.text)
+            captions += source.captions("train", count)
         else:
             captions += [[caption] * count for caption in split.text]
     return captions
 
 
 def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
-    """Pictures under another lamp; those of grasps, which have none, as they are."""
-    return [
-        split.image if isinstance(source, DrawnGrasps)
-        else relit_pictures(source, "train", split.fingerprint, stage.processor.image_size, stage.cache)  # type: ignore[arg-type]
-        for source, split in zip(stage.sources, splits, strict=True)
-    ]  # fmt: skip
-
-
-def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, heldout: list[Rendered]) -> dict[str, float]:
-    """Retrieval of captions by pictures."""
-    input_ids = processor.text([caption for split in heldout for caption in split.text])["input_ids"]
-    image = model.get_image_features(pixels_of(heldout, "image", model.device))
-    return retrieval(image, model.get_text_features(input_ids.to(model.device)))
+    """Pictures under another lamp."""
+    pairs = zip(stage.sources, splits, strict=True)
+    return [relit(stage.cache, source, "train", split) for source, split in pairs]  # type: ignore[arg-type]
 
 
 def main(stage: Stage) -> None:
@@ -134,8 +121,7 @@ def main(stage: Stage) -> None:
         config.text_config.update({"vocab_size": len(tokenizer), **special})  # type: ignore[union-attr]
         model = UniTouchModel(config, modalities=("image", "text"))
 
-    near = shown(stage.sources, splits)
-    data: dict[str, Any] = {"image": [split.image for split in splits], "shown": near}
+    data: dict[str, Any] = {"image": [split.image for split in splits]}
     if objective.attributes:
         data["attributes"] = in_deviations(np.asarray(columns(splits, "image", SHOWN["image"]).columns["attributes"]))
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
@@ -145,11 +131,10 @@ def main(stage: Stage) -> None:
     if recipe.sampler.group > 1:
         sampler = stage.sampler(recipe.sampler, splits, stage.image_embeddings(model, splits))
     trained = ImageTextObjective(model, objective)
-    watch = stage.watching(partial(watch_retrieval, model, processor), "image", "text")
-    stage.fit(trained, ArrayDataset(**data), sampler, watch)
+    stage.fit(trained, ArrayDataset(**data), sampler)
 
     embeddings = stage.image_embeddings(model, splits).numpy()
-    model.config.embedding_norm = float(np.linalg.norm(embeddings[near > 0], axis=1).mean())
+    model.config.embedding_norm = float(np.linalg.norm(embeddings, axis=1).mean())
     with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
         save_modalities(model, ("image", "text"), processor, folder)
 

@@ -41,7 +41,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     """A YAML recipe, by its path or its name in `recipes/`, under overrides; see `overridden`.
 
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
-    `sets` are named, they stand in the place of the contacts and grasps that the base draws.
+    `sets` are named, they stand in the place of the contacts that the base draws.
     """
     recipe = read_settings("recipe", _file_of("recipe", path), yaml.safe_load)
     data, drawn_by_base = recipe.get("data"), False
@@ -51,7 +51,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
         recipe["data"] = base | data
     recipe = overridden(recipe, overrides)
     if drawn_by_base and recipe["data"].get("sets"):
-        recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}
+        recipe["data"].pop("drawn", None)
     return recipe
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from datetime import timedelta
@@ -50,8 +50,6 @@ STAGES: dict[str, dict[str, str]] = {
 
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
-
-Figures = Mapping[str, float]
 
 
 class Recipe(Settings):
@@ -137,16 +135,6 @@ class Stage:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
-    def watching(self, watch: Callable[[list[Rendered]], Figures], *needs: str) -> Callable[[], Figures] | None:
-        """`watch` of about 64 held-out samples, with the columns that are needed; `None` where nothing is watched."""
-        if not self.trainer.watch_every or not self.processes.is_main_process:
-            return None
-        known = {source.sensor for source in self.sources}
-        sources = [source for source in self.data.held_out(64) if source.sensor in known]
-        splits = columns_of(sources, self.cache, self.data, self.processor, needs, "val")
-        heldout = [split.thinned(-(-64 // len(splits))) for split in splits]
-        return partial(watch, heldout) if heldout else None
-
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""
         shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
@@ -173,14 +161,13 @@ class Stage:
         objective: nn.Module,
         dataset: ArrayDataset,
         indices_of: Callable[[int], Sequence[int]] | None = None,
-        watch: Callable[[], Figures] | None = None,
     ) -> None:
         """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
         begun = {"inputs": self.inputs, "recipe": self.given}
-        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun, watch)
+        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun)
         if self.resume:
             trainer.resume()
         trainer.fit()
@@ -228,14 +215,15 @@ def save_modalities(
 ) -> None:
     """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
     config = deepcopy(model.config)
-    for name in ("ood_thresholds", "temperatures", "sensor_reaches"):
-        setattr(config, name, {})  # they were measured of other weights
+    measured = ("temperatures",) if "touch" in modalities else ("temperatures", "ood_thresholds", "sensor_reaches")
+    for name in measured:
+        setattr(config, name, {})  # of other weights
     config.save_pretrained(folder)
     processor.save_pretrained(folder)
     state = {
         f"{name}.{key}": tensor.detach().contiguous().clone()
         for modality in modalities
-        for name in MODULES[modality]
+        for name in (*MODULES[modality], *(["out_of_distribution"] if modality == "touch" else []))
         for key, tensor in getattr(model, name).state_dict().items()
     }
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})

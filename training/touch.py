@@ -3,7 +3,6 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,20 +15,20 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
+from unitouch_gen.training.abstention import ABSTAINED, fit_distance, spread
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
-from unitouch_gen.training.data import Rendered, sensor_numbers, shown
+from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
-from unitouch_gen.training.watching import pixels_of, retrieval
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
 
 class TouchAugmentation(Settings):
-    """Probabilities of turning and mirroring, exchanging colours, and softening: other lights and gels."""
+    """Probabilities of exchanging colours, and of softening: other lights and gels."""
 
-    turn: Share
     permute: Share
     blur: Share
 
@@ -43,8 +42,7 @@ class LossWeights(Settings):
 
     image: NonNegativeFloat = 1.0  # InfoNCE of touches and their pictures (Eq. 2-3)
     # 1 - cosine(touch, picture). InfoNCE asks only that others are further, and leaves touches far from all pictures
-    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing. Grasps have none: their pictures show
-    # what came of them.
+    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing.
     cosine: NonNegativeFloat = 0.0
     touch: NonNegativeFloat = 0.0  # InfoNCE of the same contact under two sensors
     attributes: NonNegativeFloat = 0.0  # squared error of a contact's measures, read linearly off its embedding
@@ -108,14 +106,14 @@ class TouchObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         trained, weights = self.trained, self.weights
         touch, patches = trained(self.augmented(batch["touch"]), batch["sensor"])
-        picture, near = batch["image_embeds"], batch["shown"]
+        picture = batch["image_embeds"]
         parts = {"image": symmetric_info_nce(touch, picture, self.temperature)}
-        parts["cosine"] = cosine_distance(touch, picture, near)
+        parts["cosine"] = cosine_distance(touch, picture)
         if weights.pairs:
             unnamed = torch.full_like(batch["sensor"], -1)
             second, other_patches = trained(self.augmented(batch["second"]), unnamed)
             parts["image"] = 0.5 * (parts["image"] + symmetric_info_nce(second, picture, self.temperature))
-            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture, near)
+            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture)
             parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
             if trained.reader is not None:
                 read = trained.reader(torch.stack([touch, second], dim=1).float())
@@ -128,14 +126,14 @@ class TouchObjective(nn.Module):
 
     def augmented(self, touch: Tensor) -> Tensor:
         """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
-        raw = batches.turn_and_flip(batches.shift_pixels(touch.float() / 255, 4), self.augment.turn)
-        raw = batches.blur_some(batches.permute_channels(raw, self.augment.permute), self.augment.blur)
+        raw = batches.permute_channels(batches.shift_pixels(touch.float() / 255, 4), self.augment.permute)
+        raw = batches.blur_some(raw, self.augment.blur)
         return normalise_pixels(batches.add_noise(batches.jitter_colours(raw, gain=0.15, offset=0.08), 0.02))
 
 
-def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """1 - cosine of embeddings (B, D), each weighed (B,); the mean over all of them."""
-    return (weight * (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1))).mean()
+def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
+    """The mean of 1 - cosine of embeddings (B, D)."""
+    return (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1)).mean()
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
@@ -154,8 +152,13 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
             model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
 
 
-def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
-    """Each sensor's prototype: the mean of all raw images it took in training."""
+def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
+    """Each sensor's prototype: the mean of all raw images it took in training.
+
+    With `reaches`, also the distance that all but a few of these are within. An encoder that has seen touches without
+    tokens can do without them beyond it.
+    """
+    model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
         chunks = (part[start : start + 1024] for part in parts for start in range(0, len(part), 1024))
@@ -163,6 +166,10 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         mean = total / sum(len(part) for part in parts) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
+        if reaches:
+            own = torch.from_numpy(np.concatenate([spread(part) for part in parts])) / 255
+            distances = layout_distances(own, model.sensor_bank.prototype(name))
+            model.config.sensor_reaches[name] = distances.quantile(1.0 - ABSTAINED / 2).item()
 
 
 def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
@@ -173,13 +180,6 @@ def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
         "attributes": in_deviations(attributes, (0, 1)),
         "maps": in_deviations(maps, (0, 1, 3, 4)).astype(np.float16),
     }
-
-
-def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, heldout: list[Rendered]) -> dict[str, float]:
-    """Retrieval of pictures by touches."""
-    sensors, device = torch.from_numpy(sensor_numbers(heldout, model.config.sensors)), encoder.bank.tokens.device
-    touch, _ = encoder(pixels_of(heldout, "touch", device), sensors.to(device))
-    return retrieval(touch, model.get_image_features(pixels_of(heldout, "image")))
 
 
 def main(stage: Stage) -> None:
@@ -195,18 +195,17 @@ def main(stage: Stage) -> None:
     model.add("touch")
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
-    set_prototypes(model, splits)
+    set_prototypes(model, splits, reaches=bool(recipe.objective.pairs))
 
     dataset = ArrayDataset(
         image_embeds=embeds,
         sensor=sensor_numbers(splits, model.config.sensors),
-        shown=shown(stage.sources, splits),
         touch=[split.touch for split in splits],
         **(pairs_of(splits) if recipe.objective.pairs else {}),
     )
     objective = TouchObjective(model, recipe.augment, recipe.objective)
-    watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")
-    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds), watch)
+    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
+    fit_distance(model, splits)
     with stage.saving() as folder:
         save_modalities(model, ("touch",), stage.processor, folder)
 

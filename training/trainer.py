@@ -47,7 +47,6 @@ class TrainerConfig(Settings):
     learning_rate: Annotated[float, Field(ge=0.0, le=1e3)]  # peak of the cosine schedule
     warmup: NonNegativeInt = 100  # steps of linear warm-up
     final_rate: Share = 0.0  # where the cosine ends, as a share of the peak
-    optimizer: Literal["adam", "adamw"] = "adamw"
     weight_decay: NonNegativeFloat = 0.05  # of the weights of linear and convolution layers alone
     beta2: Decay = 0.98
     grad_clip: NonNegativeFloat = 1.0  # largest gradient norm; 0 switches clipping off
@@ -59,7 +58,6 @@ class TrainerConfig(Settings):
     gradient_checkpointing: bool = False  # compute what blocks made once more on the way back, in place of keeping it
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
-    watch_every: NonNegativeInt = 250  # steps between looks at held-out data; 0 never looks
     seed: Seed = 0  # of initial weights, batches and noise
 
     @model_validator(mode="after")
@@ -72,8 +70,7 @@ class TrainerConfig(Settings):
 class Trainer:
     """Runs one objective, see the module's docstring, on batches `dataset[indices_of(step)]`.
 
-    `output` gets the log and checkpoints, each with `progress`, such as hashes of inputs. What `watch` returns is
-    logged every `watch_every` steps, of the averaged weights.
+    `output` gets the log and checkpoints, each with `progress`, such as hashes of inputs.
     """
 
     def __init__(
@@ -84,9 +81,8 @@ class Trainer:
         config: TrainerConfig,
         output: Path,
         progress: Mapping[str, Any] | None = None,
-        watch: Callable[[], Mapping[str, float]] | None = None,
     ):
-        self.config, self.output, self.progress, self.watch = config, output, dict(progress or {}), watch
+        self.config, self.output, self.progress = config, output, dict(progress or {})
         self.dataset, self.indices_of = dataset, indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds = 0, 0.0
@@ -145,8 +141,6 @@ class Trainer:
                 steps.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
                 if self.step % 20 == 0 or self.step == self.steps:
                     self._log({"rate": float(self.schedule.get_last_lr()[0]), **losses})
-                if self.watch is not None and config.watch_every and self.step % config.watch_every == 0 and self.main:
-                    self._log(self._watched(self.watch))
                 if self.step % config.save_every == 0 or self.step == self.steps:
                     self.save()
         if self.ema is not None:
@@ -206,20 +200,6 @@ class Trainer:
     def _placed(self, batch: Batch) -> Batch:
         return {key: value.to(self.accelerator.device) for key, value in batch.items()}
 
-    @torch.no_grad()
-    def _watched(self, watch: Callable[[], Mapping[str, float]]) -> Mapping[str, float]:
-        """What is seen with the averaged weights; the next step seeds its random numbers anew."""
-        if self.ema is not None:
-            self.ema.store(self.trained.parameters())
-            self.ema.copy_to(self.trained.parameters())
-        self.objective.eval()
-        with self.accelerator.autocast():
-            seen = watch()
-        self.objective.train()
-        if self.ema is not None:
-            self.ema.restore(self.trained.parameters())
-        return seen
-
     def _log(self, figures: Mapping[str, float]) -> None:
         if self.main:
             self.output.mkdir(parents=True, exist_ok=True)
@@ -260,10 +240,9 @@ def rate_at(step: int, config: TrainerConfig, steps: int) -> float:
 
 
 def _optimizer(module: nn.Module, config: TrainerConfig) -> torch.optim.Optimizer:
-    """Adam, with decay of the weights of linear and convolution layers; tokens, tables, norms and biases have none."""
+    """AdamW, with decay of the weights of linear and convolution layers; tokens, tables, norms and biases have none."""
     weights = {id(layer.weight) for layer in module.modules() if isinstance(layer, nn.Linear | _ConvNd)}
     trained = [p for p in module.parameters() if p.requires_grad]
     decayed, others = [p for p in trained if id(p) in weights], [p for p in trained if id(p) not in weights]
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
-    kind = torch.optim.AdamW if config.optimizer == "adamw" else torch.optim.Adam
-    return kind(groups, lr=config.learning_rate, betas=(0.9, config.beta2))
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, config.beta2))

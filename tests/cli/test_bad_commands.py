@@ -50,7 +50,7 @@ BAD = {
         ("app --host no.such.host.invalid", "'no.such.host.invalid'"),
         ("classify in/dark.png --labels wood", "`labels`"),
         ("classify in/dark.png --template feels", "`template`"),
-        ("adapt in --sensor mine --rank -1", "--rank"),
+        ("adapt in --sensor mine --steps 0", "--steps"),
         ("doctor --device meta", "`--device` is 'meta'"),
     ],
     "files": [

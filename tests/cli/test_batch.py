@@ -31,29 +31,19 @@ def lines(folder: Path) -> list[dict]:
 
 
 def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
-    (here / "in" / "table.csv").write_text(
-        'touch,name,prompt,seed,num_inference_steps\ndark.png,walls/one,"rough, brick",5,3\nbright.png,,wood,,\n'
-        "dark.png,,,6,3\n"
+    """Of a table with semicolons and a mark in front, as spreadsheets write them."""
+    (here / "in" / "table.CSV").write_text(
+        "\ufeffTouch;name;prompt;seed\ndark.png;walls/one;rough, brick;5\nbright.png;;wood;\n;;;\ndark.png;;;6\n"
     )
-    code, out, err = run("in/table.csv", "--seed", 4, "--steps", 2, "--set", "sensor=digit", "--set", "strength=0.5")
+    code, out, err = run("in/table.CSV", "--seed", 4, "--steps", 3, "--sensor", "digit", "--set", "strength=0.5")
     assert (code, err) == (0, "") and f"3 of 3 pictures are in {here / 'out'}" in out
     assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "walls/one.png"]
     told = {Path(line["picture"]).stem: (line["seed"], line["num_inference_steps"]) for line in lines(here / "out")}
-    assert told == {"one": (5, 3), "bright": (4, 2), "dark": (6, 3)}
+    assert told == {"one": (5, 3), "bright": (4, 3), "dark": (6, 3)}
     seed = torch.Generator().manual_seed(5)
     alone = pipes["touch-to-image"]("in/dark.png", "rough, brick", sensor="digit", strength=0.5, num_inference_steps=3,
                                     generator=seed).images[0]  # fmt: skip
     assert abs(np.asarray(alone, dtype=int) - np.asarray(Image.open("out/walls/one.png"))).max() <= 1
-
-
-def test_cells_are_read_as_spreadsheets_write_them(here, run, files):
-    """Semicolons and decimal commas of other countries, and numbers of a column with blanks as pandas writes them."""
-    (here / "TABLE.CSV").write_text(
-        "\ufeffTouch;seed;strength;bridge\nin/dark.png;5.0;0,5;FALSE\n;;;\n", encoding="utf-8"
-    )
-    assert run("TABLE.CSV") == (0, f"1 of 1 pictures are in {here / 'out'}\n", "")
-    (line,) = lines(here / "out")
-    assert (line["seed"], line["strength"], line["bridge"]) == (5, 0.5, False)
 
 
 def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, files):
@@ -68,9 +58,9 @@ def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, f
     assert files(here / "in" / "out") == ["bright.png", "dark.png", "manifest.jsonl", "old.png", "press.png"]
 
 
-def test_lines_of_json_and_folders_for_x_to_touch(here, run, files):
-    (here / "list.jsonl").write_text('{"text": "brick", "sensor": "digit"}\n{"text": "brick", "bridge": false}\n')
-    assert run("list.jsonl", pipeline="x-to-touch")[0] == 0
+def test_words_and_folders_for_x_to_touch(here, run, files):
+    (here / "list.csv").write_text("text,sensor\nbrick,digit\nbrick,\n")
+    assert run("list.csv", "--set", "bridge=false", pipeline="x-to-touch")[0] == 0
     soundfile.write("in/hit.wav", np.random.default_rng(0).normal(0, 0.1, 4000), 16_000)
     assert run("in", pipeline="x-to-touch")[0] == 0
     wanted = ["brick-2.png", "brick.png", "bright.png", "dark.png", "hit.png", "manifest.jsonl"]
@@ -91,13 +81,13 @@ def test_items_that_fail_are_told_and_tried_again(here, run, files):
 
 def test_lists_that_say_something_else_are_refused(here, run, refused, files):
     for table, words, said in (
-        ("touch,num_inference_step\nin/dark.png,1\n", [], "Did you mean 'num_inference_steps'?"),
+        ("touch,promt\nin/dark.png,1\n", [], "Did you mean 'prompt'?"),
         ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
         ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
         ("touch\nin/dark.png,1\n", [], "other columns in row 1"),
-        ('touch\n"in/dark.png\n', [], "no .csv or .jsonl"),
+        ('touch\n"in/dark.png\n', [], "is no table"),
         ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
-        ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`column` is 'bogus'"),
+        ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`--set` is 'bogus'"),
         ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),
     ):
         (here / "table.csv").write_text(table)

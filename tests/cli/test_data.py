@@ -47,7 +47,6 @@ def test_a_mistake_is_one_line(command, refused, folder):
         (["nowhere"], "`path` is 'nowhere', which is not there"),
         (["{folder}", "--kind", "touch_and_go"], "Data set 'mine' (touch_and_go; all) has no records"),
         (["{folder}", "--kind", "mine"], "`kind` is 'mine'"),
-        (["{folder}", "--pattern", "touch"], "`--pattern` is ['touch']; write each as touch={clip}_peak.jpg"),
         (["{folder}", "--materials", "wood"], "`materials` names 1 of 2"),
     ):
         refused(command("data", "check", *(word.format(folder=folder) for word in words)), message)

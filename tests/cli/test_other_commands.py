@@ -55,9 +55,9 @@ def test_a_folder_of_touches_becomes_a_sensor(command, refused, tmp_path):
         pixels = np.random.default_rng(number).integers(0, 256, (70, 64, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / "mine" / f"{number}.png")
     file = tmp_path / "out" / "mine.safetensors"
-    words = ("adapt", tmp_path / "mine", "--sensor", "mine", "--steps", 2, "--rank", 2, "-o", file)
+    words = ("adapt", tmp_path / "mine", "--sensor", "mine", "--steps", 2, "-o", file)
     code, out, _ = command(*words)
-    assert code == 0 and "touches that were held out" in out
+    assert code == 0 and str(file) in out.replace("\n", "")
     assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
     refused(command(*words), "pass `--overwrite`")
 

@@ -25,7 +25,7 @@ SPACE = {
     "touch_config": {**VIT, "image_height": 32, "image_width": 32},
     "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
 }  # fmt: skip
-DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1, "held_out": 2}
+DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
 BLOCKS |= {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
 

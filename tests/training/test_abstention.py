@@ -1,43 +1,34 @@
-"""Fitting what a joint space does not know: what is written, and that nothing else changes."""
+"""What a touch encoder does not know: the distance that is fitted, and where it is kept."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
-from safetensors.torch import load_file
 from scipy.spatial.distance import mahalanobis
 
-from unitouch_gen.evaluation.metrics import calibration_error
-from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temperature
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.abstention import fit_distance, fit_gaussians
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import save_modalities
-
-SETTINGS = ("data.drawn={sensors: [digit], objects: 4, contacts_per_object: 1, held_out: 2}",)
-
-
-@pytest.fixture
-def space(model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, tmp_path: Path) -> Path:
-    model.sensor_bank.set_prototype("digit", torch.from_numpy(split.touch[:].copy()).float().mean(dim=0) / 255)
-    save_modalities(model.half(), MODALITIES, processor, tmp_path / "space")
-    return tmp_path / "space"
+from unitouch_gen.training.touch import set_prototypes
 
 
-def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_written_and_weights_stay(
-    space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered
+def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(
+    model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, tmp_path: Path
 ) -> None:
-    before = load_file(space / "model.safetensors")
-    abstention(joint=space, overrides=list(SETTINGS), cache=cache)
-    after = load_file(space / "model.safetensors")
-    assert {key for key in after if not key.startswith("out_of_distribution.")} == set(before)
-    assert all(torch.equal(after[key], tensor) for key, tensor in before.items())
-    new = {key: tensor for key, tensor in after.items() if key not in before}
-    assert new and all(tensor.dtype == torch.float16 for tensor in new.values())
-    again = UniTouchModel.from_pretrained(space)
-    assert set(again.config.temperatures) == {*MODALITIES}
-    assert list(again.config.ood_thresholds) == ["touch"]
-    assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
+    splits = [split, replace(split, sensor="gelsight", touch=split.second)]
+    set_prototypes(model, splits, reaches=True)
+    fit_distance(model, splits)
+    model.config.temperatures = {"touch": 0.2}
+    save_modalities(model, ("image", "text"), processor, tmp_path / "space")
+    assert UniTouchModel.from_pretrained(tmp_path / "space").config.ood_thresholds == {}
+    save_modalities(model, ("touch",), processor, tmp_path / "touch")
+    again = UniTouchModel.from_pretrained(tmp_path / "touch")
+    assert [*again.config.ood_thresholds] == ["touch"] and again.config.temperatures == {}
+    assert (
+        set(again.config.sensor_reaches) == {"gelsight", "digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
+    )
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
         reasons = again.unknown_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high
@@ -56,13 +47,3 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
     np.testing.assert_allclose(gaussians(torch.from_numpy(others)), expected, rtol=1e-3)
     halved = gaussians.half()(torch.from_numpy(others))
     np.testing.assert_allclose(halved, expected, rtol=0.05, atol=0.1)
-
-
-@pytest.mark.parametrize("unit", [0.3, 100.0])
-def test_the_temperature_that_labels_were_drawn_at_is_found(unit: float) -> None:
-    generator = torch.Generator().manual_seed(0)
-    scores = unit * (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0)
-    labels = torch.multinomial((scores / (0.2 * unit)).softmax(dim=1), 1, generator=generator)[:, 0]
-    found = fit_temperature(scores, labels)
-    assert found == pytest.approx(0.2 * unit, rel=0.05)
-    assert calibration_error((scores / found).softmax(dim=1), labels) < 0.01

@@ -81,11 +81,6 @@ def moved(image: Tensor) -> list[Tensor]:
     return [image[:, down][:, :, right] for down, right in itertools.product(place, repeat=2)]
 
 
-def turned(image: Tensor) -> list[Tensor]:
-    """The eight symmetries of a square."""
-    return [one.rot90(turns, dims=(1, 2)) for one in (image, image.flip(2)) for turns in range(4)]
-
-
 def blurred(image: Tensor) -> list[Tensor]:
     """An image, and what the 3 x 3 binomial kernel makes of it."""
     padded = torch.nn.functional.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
@@ -97,7 +92,6 @@ def blurred(image: Tensor) -> list[Tensor]:
     ("augment", "candidates"),
     [
         (lambda images: batches.shift_pixels(images, 2), moved),
-        (lambda images: batches.turn_and_flip(images, 1.0), turned),
         (
             lambda images: batches.permute_channels(images, 1.0),
             lambda i: [i[[*p]] for p in itertools.permutations(range(3))],

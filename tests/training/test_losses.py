@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.losses import denoising_losses, info_nce, symmetric_info_nce
-from unitouch_gen.training.watching import retrieval
 
 TOUCH, IMAGE = torch.randn(2, 7, 5, generator=torch.Generator().manual_seed(0))
 
@@ -40,16 +39,6 @@ def test_info_nce_is_equation_1_and_has_its_closed_forms(tau: float) -> None:
     assert info_nce(basis, torch.ones(6, 6), tau).item() == pytest.approx(math.log(6), abs=1e-5)
     half, single = (info_nce(TOUCH.bfloat16().to(kind), IMAGE, tau) for kind in (torch.bfloat16, torch.float32))
     assert half.dtype == torch.float32 and torch.equal(half, single)
-
-
-def test_retrieval_counts_own_keys_among_the_nearest() -> None:
-    assert retrieval(torch.eye(10), torch.eye(10))["retrieval_top1"] == 1.0
-    angles = torch.arange(10) * 0.1
-    circle = torch.stack([angles.cos(), angles.sin()], dim=1)
-    turned = retrieval(circle, circle.roll(-1, 0))  # own keys are the next ones' twins, the last one's is the first
-    assert turned["retrieval_top1"] == 0.0 and turned["retrieval_top5"] == pytest.approx(0.9)
-    same = retrieval(torch.ones(20, 8), torch.ones(20, 8))
-    assert same["retrieval_top1"] == pytest.approx(same["chance_top1"]) == pytest.approx(0.05)
 
 
 class Predicts(nn.Module):

@@ -14,7 +14,7 @@ from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.world import ATTRIBUTES, MATERIALS, World
 from unitouch_gen.world.questions import QUESTIONS, answered
 
-SHORT = ("data.drawn={sensors: [digit], objects: 1, contacts_per_object: 1, held_out: 1}", "trainer.batch_size=8",
+SHORT = ("data.drawn={sensors: [digit], objects: 1, contacts_per_object: 1}", "trainer.batch_size=8",
          "trainer.steps=2", "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2")  # fmt: skip
 TINY = ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24", "model.num_hidden_layers=2",
         "data.image_size=32", "data.audio={clip_seconds: 0.2, clips: 1, mel_bins: 16, frames: 24}")  # fmt: skip

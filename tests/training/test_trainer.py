@@ -194,20 +194,3 @@ def test_gradients_are_the_same_where_blocks_compute_once_more(model: UniTouchMo
         (output if isinstance(output, Tensor) else output[0]).square().mean().backward()
     torch.testing.assert_close(*({name: p.grad for name, p in one.named_parameters()} for one in (plain, again)))
     assert any(getattr(part, "gradient_checkpointing", False) for part in again.modules())
-
-
-def test_what_is_watched_is_of_the_averaged_weights_and_leaves_training_alone(tmp_path: Path) -> None:
-    plain, expected = make(tmp_path / "plain", ema_decay=0.9)
-    plain.fit()
-    (watched, objective), seen = make(tmp_path / "watched", ema_decay=0.9, watch_every=5), []
-
-    def watch() -> dict[str, float]:
-        assert not objective.training
-        seen.append(objective.weights())
-        return {"drawn": float(torch.rand(()))}
-
-    watched.watch = watch
-    watched.fit()
-    assert equal(objective.weights(), expected.weights()) and equal(seen[-1], expected.weights())
-    lines = [json.loads(line) for line in (tmp_path / "watched" / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if "drawn" in line] == [5, 10, 15, 20]

@@ -29,15 +29,14 @@ def gallery() -> Scene:
 
 def close(one: Scene, other: Scene, rows: slice = slice(None), atol: float = 1e-4) -> bool:
     pairs = [(getattr(one, name), getattr(other, name)[rows]) for name in ("image", "audio", "grasp")]
-    pairs += [(one.outcome.image, other.outcome.image[rows])]
     for by_sensor in ("touch", "depth", "attributes"):
         pairs += [(values, getattr(other, by_sensor)[name][rows]) for name, values in getattr(one, by_sensor).items()]
     same = all(torch.allclose(a, b, rtol=0, atol=atol) for a, b in pairs)
-    return same and one.text == other.text[rows] and one.outcome.text == other.outcome.text[rows]
+    return same and one.text == other.text[rows]
 
 
 def test_every_modality_is_finite_and_in_range(gallery: Scene) -> None:
-    for images in (gallery.image, *gallery.touch.values(), gallery.outcome.image):
+    for images in (gallery.image, *gallery.touch.values()):
         assert images.shape == (68, 3, 32, 32) and images.min() >= 0.0 and images.max() <= 1.0
     assert gallery.audio.abs().max() <= 1.0
     for values in (*gallery.depth.values(), *gallery.attributes.values(), gallery.audio, gallery.grasp):
@@ -59,9 +58,8 @@ def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, moda
     made = small().render(*(part[:5] for part in NAMES), modalities=(modality,), sensors=USED[:2])
     present = {name for name in MODALITIES if getattr(made, name) not in (None, {})}
     assert present == {modality}
-    computed = {"image", "grasp", "outcome"} if modality == "outcome" else {modality}
-    surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": [], "outcome": []}
-    others = [name for name in MODALITIES if name not in computed]
+    surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": []}
+    others = [name for name in MODALITIES if name != modality]
     assert made.left_out == others + surfaces.get(modality, ["colours of surfaces"])
     found, expected = getattr(made, modality), getattr(gallery, modality)
     for name, values in found.items() if isinstance(found, dict) else ():

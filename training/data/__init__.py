@@ -8,7 +8,6 @@ from unitouch_gen.training.data.columns import (
     columns_of,
     material_names,
     sensor_numbers,
-    shown,
 )
 from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.records import Record
@@ -16,5 +15,5 @@ from unitouch_gen.training.data.sets import RecordSet, open_dataset
 
 __all__ = [
     "DataConfig", "DrawnConfig", "DrawnContacts", "Record", "RecordSet", "Rendered", "Source", "columns_of",
-    "computed_once", "image_embeddings", "material_names", "open_dataset", "sensor_numbers", "shown", "weights_hash",
+    "computed_once", "image_embeddings", "material_names", "open_dataset", "sensor_numbers", "weights_hash",
 ]  # fmt: skip

@@ -5,8 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +19,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, SensorName
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.records import Record, few
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
@@ -37,22 +36,12 @@ class SetConfig(Settings):
     split: SplitBy | None = None
     sensor: str | None = None
     materials: list[str] | None = None
-    bgr: bool = False
     sampling_rate: PositiveInt | None = None
-    patterns: dict[str, str] | None = None
 
-    def read(self, split: str) -> list[RecordSet]:
-        """The records of a split, a part for each sensor."""
+    def read(self) -> list[RecordSet]:
+        """The records to train on, a part for each sensor."""
         data = open_dataset(self.path, **self.model_dump(exclude={"path", "split"}))
-        return data.split(split, self.split).by_sensor()
-
-    def held_out(self, count: int) -> list[RecordSet]:
-        """At most `count` records of each sensor that are not in the training split; none where all train."""
-        for split in ("val", "test") if self.split != "none" else ():
-            with suppress(InvalidInputError):  # it has no such split
-                parts = [part.thinned(count) for part in self.read(split)]
-                return [part for part in parts if len(part) > 1]
-        return []
+        return data.split("train", self.split).by_sensor()
 
 
 class DataConfig(Settings):
@@ -60,25 +49,18 @@ class DataConfig(Settings):
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None  # contacts of the world
-    grasps: list[SensorName] = []  # sensors that feel such contacts as grasps, with pictures of what comes of these
     image_size: int | None = None  # side of the pictures, pixels, where no joint space says it
     touch_size: Annotated[int, Field(ge=8)] | None = None  # side of the touches, pixels; `image_size` if left out
     audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
     def sources(self) -> list[Source]:
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
-        if self.drawn is None and (self.grasps or not self.sets):
+        if self.drawn is None and not self.sets:
             raise InvalidInputError(
-                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts, of "
-                "which `grasps` are."
+                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts."
             )
-        drawn = self.drawn.sources(self.grasps) if self.drawn else []
-        return [*drawn, *(part for one in self.sets for part in one.read("train"))]
-
-    def held_out(self, count: int) -> list[Source]:
-        """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        drawn = self.drawn.sources(self.grasps) if self.drawn else []
-        return [*drawn, *(part for one in self.sets for part in one.held_out(count))]
+        drawn = self.drawn.sources() if self.drawn else []
+        return [*drawn, *(part for one in self.sets for part in one.read())]
 
 
 @dataclass
@@ -100,12 +82,6 @@ class Rendered:
     def __len__(self) -> int:
         return len(self.material)
 
-    def thinned(self, count: int) -> "Rendered":
-        """At most `count` of its samples, spread over all, in memory."""
-        rows = np.unique(np.linspace(0, len(self) - 1, count).astype(int))
-        columns = {name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
-        return replace(self, **columns, text=[self.text[row] for row in rows])
-
 
 def has(record: Record, need: str) -> bool:
     """Whether a record has a column that a stage may need: touch, image, background, audio, text, material, sensor."""
@@ -120,12 +96,11 @@ def columns_of(
     config: DataConfig,
     processor: UniTouchProcessor,
     needs: Sequence[str],
-    split: str = "train",
 ) -> list[Rendered]:
-    """The columns of each source, rendered or decoded if the cache does not hold them yet.
+    """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
-    `needs` are those of `has`; other columns of data sets stay empty. `split` is of drawn contacts: data sets hold the
-    records of theirs. Raises `InvalidInputError` if a data set lacks what is needed, or files cannot be read.
+    `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
+    what is needed, or files cannot be read.
     """
     for data in (source for source in sources if isinstance(source, RecordSet)):
         lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if not has(r, need)]
@@ -138,7 +113,7 @@ def columns_of(
     return [
         decoded(cache, source, processor, needs, names, config.touch_size)
         if isinstance(source, RecordSet)
-        else drawn(cache, source, split, processor)
+        else drawn(cache, source, "train", processor)
         for source in sources
     ]
 
@@ -175,6 +150,19 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
         )
     text = json.loads((folder / "text.json").read_text())
     return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
+
+
+def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.ndarray:
+    """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), once into the cache."""
+
+    def write(arrays: Arrays, _: Path) -> None:
+        done = 0
+        for pictures in tqdm(source.relit(split, seen.image.shape[-1]), f"{source.name}, relit", mininterval=5):
+            arrays["image"][done : done + len(pictures)] = as_bytes(pictures)
+            done += len(pictures)
+
+    folder = Path(cache) / f"{source.name}-{split}-relit-{seen.fingerprint}"
+    return mapped(folder, len(seen), {"image": (np.uint8, *seen.image.shape[1:])}, write)["image"]
 
 
 def decoded(
@@ -246,12 +234,6 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     """A record's sound as processors take it: its file, or samples and their rate."""
     file = str(record.sound)
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
-
-
-def shown(sources: Sequence[Source], splits: Sequence[Rendered]) -> np.ndarray:
-    """1 for each sample whose picture shows what is touched, and 0 for grasps, whose shows what came of it, (N,)."""
-    near = [float(not isinstance(source, DrawnGrasps)) for source in sources]
-    return np.repeat(np.array(near, dtype=np.float32), [len(split) for split in splits])
 
 
 def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:

@@ -5,9 +5,8 @@ Sixteen contacts share a pair of sensors, which see about as much of them. The f
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -19,12 +18,20 @@ from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, World
 from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.gel import untouched_gel
-from unitouch_gen.world.grasps import outcome_captions, told_lifted
 from unitouch_gen.world.sensors import draw_sensor
 
 GROUP = 16
 """Contacts to a pair of sensors."""
+
+
+class Relit(World):
+    """The same contacts under other lamps."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
+        draws = super().draw(material, object_, contact)
+        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
 @dataclass(frozen=True)
@@ -39,15 +46,13 @@ class DrawnContacts:
     objects: int
     contacts_per_object: int
     seed: int = 0
-    held_out: int = 16
+    held_out: int = 16  # objects of the other splits
 
     materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
-    kind: ClassVar[str] = "drawn"
-    pictured: ClassVar[tuple[str, ...]] = ("image", "text")
 
     @property
     def name(self) -> str:
-        return f"{self.kind}-{self.sensor or 'any'}"
+        return f"drawn-{self.sensor or 'any'}"
 
     def contacts(self, split: str) -> tuple[Tensor, Tensor, Tensor]:
         """Material, object and contact, int64 (N,), in an order in which neighbours have nothing in common."""
@@ -74,13 +79,12 @@ class DrawnContacts:
 
     def scenes(self, split: str, size: int) -> Iterator[tuple[Any, dict[str, Tensor]]]:
         """Scenes, with touch (n, 2, 3, S, S), attributes (n, 2, 13) and maps (n, 2, 4, 8, 8) of both sensors."""
-        for scene, sensors in self.rendered(split, size, "touch", "depth", "audio", "attributes", *self.pictured):
+        for scene, sensors in self.rendered(split, size, "touch", "depth", "audio", "attributes", "image", "text"):
             seen = {
                 "touch": [scene.touch[sensor.name] for sensor in sensors],
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
-            scene = replace(scene, **scene.outcome._asdict()) if "outcome" in self.pictured else scene
             yield scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
     def untouched(self, split: str, size: int) -> Tensor:
@@ -89,14 +93,16 @@ class DrawnContacts:
         pairs = [self.pair(split, group) for group in groups]
         return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
 
-    def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
-        """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
+    def relit(self, split: str, size: int) -> Iterator[Tensor]:
+        """Pictures (n, 3, S, S) of the scenes, each under the lamp and white balance of the next contact."""
+        world = Relit(self.seed, image_size=size)
+        for names in zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True):
+            yield world.render(*names, modalities=("image",)).image  # type: ignore[misc]
+
+    def captions(self, split: str, variants: int) -> list[list[str]]:
+        """As many captions of each contact of a split as asked for, the first of them that of its scene."""
         draws = World(self.seed).draw(*self.contacts(split))
-        tell = partial(described, draws)
-        if "outcome" in self.pictured:
-            held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
-            tell = partial(outcome_captions, draws, held)
-        return [list(texts) for texts in zip(*map(tell, range(variants)), strict=True)]
+        return [list(texts) for texts in zip(*(described(draws, one) for one in range(variants)), strict=True)]
 
     def fingerprint(self, split: str) -> str:
         """Sixteen hexadecimal digits that change when what is rendered does: of names and some contacts."""
@@ -116,13 +122,6 @@ class DrawnContacts:
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
 
 
-class DrawnGrasps(DrawnContacts):
-    """Touches before an object is lifted, with pictures and captions of what comes of it."""
-
-    kind: ClassVar[str] = "grasps"
-    pictured: ClassVar[tuple[str, ...]] = ("outcome",)
-
-
 SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", name, SENSORS))] | None
 """A sensor of the world, or null for drawn ones."""
 
@@ -134,10 +133,8 @@ class DrawnConfig(Settings):
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
     seed: NonNegativeInt = 0  # of the world
-    held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16  # objects to validate on
 
-    def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
-        """One for each sensor, and behind them one for each sensor that grasps are felt by."""
-        kinds = [*((DrawnContacts, sensor) for sensor in self.sensors), *((DrawnGrasps, sensor) for sensor in grasps)]
+    def sources(self) -> list[DrawnContacts]:
+        """One for each sensor."""
         settings = self.model_dump(exclude={"sensors"})
-        return [kind(number, sensor, **settings) for number, (kind, sensor) in enumerate(kinds)]
+        return [DrawnContacts(number, sensor, **settings) for number, sensor in enumerate(self.sensors)]

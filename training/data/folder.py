@@ -7,10 +7,10 @@
     touch/..., picture/..., background/...      trees of the same names, with any endings; background.png is that of all
                                                 in its folder
 
-A table needs `touch` alone: a column, or a pattern over the other columns, such as {clip}_peak.jpg.
+A table needs `touch` alone.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,29 +24,23 @@ TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 SPLITS = ("train", "val", "test")
 
 
-def read(folder: Path, patterns: Mapping[str, str] | None = None) -> Iterator[Record | str]:
+def read(folder: Path) -> Iterator[Record | str]:
     """What its table names, or the images in it."""
     tables = [file for file in found(folder, "*") if file.suffix.lower() in (".csv", ".tsv")]
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
-    yield from read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder)
+    yield from read_rows(folder, tables[0]) if tables else read_tree(folder)
 
 
-def read_rows(folder: Path, table: Path, patterns: Mapping[str, str]) -> Iterator[Record]:
-    """What each row of the table names."""
+def read_rows(folder: Path, table: Path) -> Iterator[Record]:
+    """What each row of the table names; columns that are none of a record's are labels."""
     rows = read_table(table)
-    names = {name: f"{{{name}}}" for name in (*FRAMES, "sound") if name in rows[0]} | dict(patterns)
-    if "touch" not in names:
-        names["touch"] = f"{{{column_of(table, rows[0], ('touch', 'tactile', 'file', 'filename', 'path', 'image'))}}}"
-    used = {name for name in rows[0] if any(f"{{{name}}}" in pattern for pattern in names.values())}
-    labels = [name for name in rows[0] if name == "material" or name not in {*names, *TEXTS, *used}]
+    touch = column_of(table, rows[0], ("touch", "tactile", "file", "filename", "path", "image"))
+    columns = {name: name for name in (*FRAMES, "sound") if name in rows[0]} | {"touch": touch}
+    labels = [name for name in rows[0] if name not in {*columns.values(), *TEXTS}]
     for row in rows:
-        try:
-            files = {name: pattern.format(**row) for name, pattern in names.items()}
-        except (LookupError, ValueError) as error:
-            raise InvalidInputError(f"`patterns` is {patterns}; the columns are {', '.join(row)}.") from error
-        known: dict[str, Any] = {"id": files["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
-        known |= {name: str(folder / file) for name, file in files.items() if file}
+        known: dict[str, Any] = {"id": row[touch]} | {name: row[name] or None for name in TEXTS if name in row}
+        known |= {name: str(folder / row[column]) for name, column in columns.items() if row[column]}
         known |= {name: Frame(known[name]) for name in FRAMES if name in known}
         if known.get("split") not in (None, *SPLITS):
             raise InvalidInputError(

@@ -13,9 +13,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed, float_pixels
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, sound_of
+from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, relit, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
-from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE, World
@@ -46,7 +45,7 @@ def world_contacts(
     return Contacts(
         seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
         image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds,
-        relit=lambda: float_pixels(relit_pictures(source, split, seen.fingerprint, size, cache)),
+        relit=lambda: float_pixels(relit(cache, source, split, seen)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
         attributes=attributes, asked=asked_of(World(source.seed).draw(*source.contacts(split)), attributes[:, 0]),
     )  # fmt: skip

@@ -1,7 +1,6 @@
 """Records, each a touch with all that is known of it; and what layouts of data sets find and read them with."""
 
 import threading
-from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,7 +14,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import is_hidden, natural
 from unitouch_gen.models.images import load_images
-from unitouch_gen.models.videos import shown
+from unitouch_gen.models.videos import read_video
 
 IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}
 """Suffixes of files that Pillow reads as images."""
@@ -28,7 +27,6 @@ class Frame:
     path: str
     index: int | None = None  # in a video, the number of the frame, from 0 in the order in which frames are shown
     key: str | None = None  # in an HDF5 file, the name of the array (H, W, 3)
-    bgr: bool = False  # whether blue is stored in the place of red, as OpenCV has images in memory
 
     def read(self) -> Tensor:
         """Pixels (3, H, W): uint8, or float32 in [0, 1]; raises an `InvalidInputError` if they cannot be read."""
@@ -41,8 +39,7 @@ class Frame:
                     source = file[self.key][()]
         except (OSError, LookupError, ValueError) as error:  # PyAV's and h5py's are among these
             raise InvalidInputError(f"{self.path!r} cannot be read: {first_line(error)}.") from error
-        pixels = load_images("image", source)[0]
-        return pixels.flip(0) if self.bgr else pixels
+        return load_images("image", source)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,34 +100,30 @@ def _opened(path: str, thread: int) -> "Video":
 
 
 def open_video(path: str) -> "Video":
-    """An open video that no other thread reads."""
+    """A video that no other thread reads."""
     return _opened(path, threading.get_ident())
 
 
 class Video:
-    """An open video that is read forwards, and seeks where there is a key frame on the way."""
+    """A video that is read forwards, and from its beginning for a frame that is behind."""
 
     def __init__(self, path: str):
-        self.container = needed("av").open(path)
-        self.stream = self.container.streams.video[0]
-        packets = [packet for packet in self.container.demux(self.stream) if packet.pts is not None]
-        self.times = sorted(packet.pts for packet in packets)
-        self.keys = sorted(packet.pts for packet in packets if packet.is_keyframe)
-        self.frames: Iterator[Any] = iter(())
-        self.time = max(self.times, default=0)  # of the frame read last
+        self.path, self.place = path, -1  # number of the frame that was read last
+        self.frames: Iterator[np.ndarray] = iter(())
 
     def frame(self, index: int) -> np.ndarray:
         """Pixels (H, W, 3) of a frame by its number."""
-        if not 0 <= index < len(self.times):
-            raise ValueError(f"the video has {len(self.times)} frames, but not number {index}")
-        wanted = self.times[index]
-        key = self.keys[max(bisect_right(self.keys, wanted) - 1, 0)]
-        if not key <= self.time < wanted:
-            self.container.seek(key, stream=self.stream)
-            self.frames = self.container.decode(self.stream)
-        for frame in self.frames:
-            if frame.pts is not None and frame.pts >= wanted:
-                self.time = frame.pts
-                return shown(frame, self.stream)
-        self.time = self.times[-1]
-        raise ValueError("the video ends before that frame")
+        if self.place < 0 or index <= self.place:
+            self.frames, self.place = read_video("video", self.path), -1
+        for pixels in self.frames:
+            self.place += 1
+            if self.place == index:
+                return pixels
+        count, self.place = self.place + 1, -1
+        raise ValueError(f"the video has {count} frames, but not number {index}")
+
+
+def frames_in(path: str) -> int:
+    """Number of a video's frames."""
+    with needed("av").open(path) as container:
+        return sum(packet.pts is not None for packet in container.demux(video=0))

@@ -77,10 +77,6 @@ class RecordSet:
         """What a training run keeps on record of it."""
         return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}
 
-    def thinned(self, count: int) -> "RecordSet":
-        """At most `count` of its records, one in every so many."""
-        return replace(self, records=self.records[:: -(-len(self) // count)])
-
     def by_sensor(self) -> "list[RecordSet]":
         """A part for each sensor, in the order of their first records."""
         sensors = dict.fromkeys(record.sensor for record in self.records)
@@ -119,33 +115,27 @@ def open_dataset(
     *,
     sensor: str | None = None,
     materials: Sequence[str] | None = None,
-    bgr: bool = False,
     sampling_rate: int | None = None,
-    patterns: Mapping[str, str] | None = None,
 ) -> RecordSet:
     """Lists the records of a data set in the layout it was published in, or of a folder of one's own.
 
-    No image is read, but for a few of HCT's, to see whether its folders are exchanged.
+    No image is read.
 
     Args:
         path: Its folder.
         kind: One of `layouts()`, or "auto" to see which it is.
         sensor: Name for the sensor of all touches, in place of what the data set says.
         materials: Names for its materials, by their numbers.
-        bgr: Whether touches are stored with blue in the place of red.
         sampling_rate: Of sounds in .npy files, Hz.
-        patterns: For a folder with a table: "touch", "picture", "background" and "sound" as patterns of file names over
-            its columns, such as "{clip}_peak.jpg".
 
     Raises:
         InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
             missing, some of which the message names.
     """
     kinds = layouts()
-    check_choice("kind", kind, ("auto", *kinds)), check_kind("bgr", bgr, bool)
-    for name, value, wanted in (("sensor", sensor, str), ("patterns", patterns, Mapping)):
-        if value is not None:
-            check_kind(name, value, wanted)
+    check_choice("kind", kind, ("auto", *kinds))
+    if sensor is not None:
+        check_kind("sensor", sensor, str)
     names = None if materials is None else check_texts("materials", materials)
     place = Path(os.path.realpath(as_path("path", path)))
     if not place.is_dir() or not any(place.iterdir()):
@@ -156,10 +146,8 @@ def open_dataset(
         if len(known) > 1:
             raise InvalidInputError(f"`path` is {str(path)!r}, which looks like {' and '.join(known)}; say its `kind`.")
         kind = known[0] if known else "folder"
-    if patterns and kind != "folder":
-        raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
     try:
-        found = list(kinds[kind].read(place, **({"patterns": patterns} if patterns else {})))
+        found = list(kinds[kind].read(place))
         records = [record for record in found if isinstance(record, Record)]
         files = {file for record in records for file in record.files}
         if missing := sorted(file for file in files if not os.path.isfile(file)):
@@ -171,8 +159,6 @@ def open_dataset(
             replace(
                 record,
                 sensor=sensor or record.sensor,
-                touch=replace(record.touch, bgr=bgr),
-                background=record.background and replace(record.background, bgr=bgr),
                 labels={label: classes[label].index(name) for label, name in record.labels.items()},
             )
             for record in records

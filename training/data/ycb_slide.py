@@ -10,7 +10,7 @@ read.
 from collections.abc import Iterator
 from pathlib import Path
 
-from unitouch_gen.training.data.records import Frame, Record, found, frame_at, images_in, open_video
+from unitouch_gen.training.data.records import Frame, Record, found, frame_at, frames_in, images_in
 
 REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
 """Also where one half of the data set is alone."""
@@ -26,7 +26,7 @@ def read(folder: Path) -> Iterator[Record]:
         frames = {image.name: Frame(str(image)) for image in images_in(place)}
         if not frames:
             video = str(run / "frames.mp4")
-            frames = {f"frame_{n:07d}.jpg": Frame(video, index=n) for n in range(len(open_video(video).times))}
+            frames = {f"frame_{n:07d}.jpg": Frame(video, index=n) for n in range(frames_in(video))}
         item, recording = run.parent.name, f"{sensor}/{run.parent.name}/{run.name}"
         labels = {"material": item.lstrip("0123456789_").replace("_", " ")}
         for name, touch in frames.items():

@@ -1,11 +1,11 @@
-"""`unitouch-gen batch`: a picture of every line of a list, or every file of a folder, over accelerate's processes.
+"""`unitouch-gen batch`: a picture of every line of a table, or every file of a folder, over accelerate's processes.
 
 A picture that is there is not made again: the same command goes on where one was killed, and tries anew what failed.
 """
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,34 +15,33 @@ from unitouch_gen import errors
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, first_line
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
 
 if TYPE_CHECKING:
     from PIL import Image
 
 FILES = ("touch", "image", "audio", "background")
-OWN = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
-"""Arguments in which the pictures of one call may differ; in `options.SETTABLE` they are alike."""
+COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
+"""Arguments of a call in which its pictures may differ."""
 
 
 def batch(
     context: Context,
-    source: Annotated[Path, Argument(help="A .csv or .jsonl with a line for each picture, or a folder.")],
+    source: Annotated[Path, Argument(help="A .csv with a line for each picture, or a folder.")],
     output: Annotated[Path, Option("--output", "-o", help="A folder; pictures that are there stay.")],
     pipeline: Annotated[str, Option(help=f"{', '.join(DRAWING)}.")] = "touch-to-image",
-    num_inference_steps: options.Steps = None,
-    settings: Annotated[list[str] | None, Option("--set", help="A column of lines without: sensor=digit.")] = None,
+    sensor: options.Sensor = None, num_inference_steps: options.Steps = None, settings: options.Settings = None,
     seed: options.Seed = 0, batch_size: options.BatchSize = 8, model: options.Model = None,
     load_sensor: options.LoadSensor = None, dtype: options.Dtype = None, device: options.Device = "auto",
 ) -> None:  # fmt: skip
-    """Makes the pictures of a list or a folder that are not there yet; exits with 1 if some fail.
+    """Makes the pictures of a table or a folder that are not there yet; exits with 1 if some fail.
 
     Processes that torchrun or accelerate launch starts share the work.
 
     Example: unitouch-gen batch touches/ -o pictures/
     """
     check_choice("--pipeline", pipeline, DRAWING)
-    rows = in_folder(source, pipeline, output) if source.is_dir() else in_list(source)
+    rows = in_folder(source, pipeline, output) if source.is_dir() else in_table(source)
     import torch
     from accelerate import PartialState
     from accelerate.utils import gather_object
@@ -50,18 +49,17 @@ def batch(
 
     from unitouch_gen import pipelines
 
-    known = inspect.signature(getattr(pipelines, CLASSES[pipeline]).__call__).parameters
-    columns = ["name", "seed", *(column for column in (*OWN, *options.SETTABLE) if column in known)]
-    shared = {"seed": seed, **checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())}
-    if num_inference_steps is not None:
-        shared["num_inference_steps"] = num_inference_steps
+    kind = getattr(pipelines, CLASSES[pipeline])
+    shared, known = options.call_arguments(context, kind), inspect.signature(kind.__call__).parameters
+    columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
     folder = source if source.is_dir() else source.parent
-    pictures = pictures_of([shared | checked(row, columns, folder) for row in rows], output)
+    pictures = pictures_of([{"seed": str(seed), **row} for row in rows], columns, folder, output, shared)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
-    calls = calls_of([picture for picture in pictures if not picture.file.exists()], batch_size)
+    most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
+    calls = calls_of([picture for picture in pictures if not picture.file.exists()], most)
     state.wait_for_everyone()  # or the last process would not miss what the first has made
     if device == "auto" and state.num_processes > 1:
         context.params["device"] = str(state.device)
@@ -85,77 +83,52 @@ def batch(
         raise Exit(1)
 
 
-# The list -------------------------------------------------------------------------------------------------------------
-
-
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
     """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     paths = [file for file in sorted(folder.rglob("*")) if output.resolve() not in file.resolve().parents]
-    files = files_in(folder, paths, columns)
-    places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
-    return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
+    places = [file.relative_to(folder) for file in files_in(folder, paths, columns)]
+    return [{columns[place.suffix.lower()]: str(place), "name": str(place.with_suffix(""))} for place in places]
 
 
-def in_list(file: Path) -> list[dict[str, Any]]:
-    """The columns of every line of a table with a header, or of a .jsonl; blank cells are left out."""
-    from unitouch_gen.files import check_file, read_table, read_text
+def in_table(file: Path) -> list[dict[str, str]]:
+    """The columns of every line of a table with a header; blank cells are left out."""
+    from unitouch_gen.files import check_file, read_table
 
-    check_file("source", file, "a .csv or .jsonl file")
-    try:
-        rows: list[Any]
-        if file.suffix.lower() in (".csv", ".tsv"):
-            rows = read_table(file)
-        else:
-            rows = [dict(json.loads(line)) for line in read_text(file).split("\n") if line.strip()]
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}"
-        raise InvalidInputError(message) from error
-    return [{column: value for column, value in row.items() if value not in (None, "")} for row in rows]
+    check_file("source", file, "a .csv file")
+    return [{column: cell for column, cell in row.items() if cell} for row in read_table(file)]
 
 
-def checked(row: Mapping[str, Any], columns: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Columns as arguments of a call; names of files start from a folder."""
-    found: dict[str, Any] = {}
-    for column, value in row.items():
-        if check_choice("column", column, columns) in ("name", *OWN):
-            check_kind(column, value, str)
-        elif isinstance(value, str):
-            value = options.value_of(value)
-        found[column] = str(folder.absolute() / value) if column in FILES else value
-    return found
+def pictures_of(
+    rows: Sequence[dict[str, str]], columns: Sequence[str], folder: Path, output: Path, settings: dict[str, Any]
+) -> list[Picture]:
+    """What is made of each row, and where it goes: by its name, or that of what it is made of.
 
-
-def pictures_of(rows: Sequence[dict[str, Any]], output: Path) -> list[Picture]:
-    """What is made of each row, and where it goes: by its name, or that of what it is made of."""
-    names = []
+    Names of files in the rows start from a folder.
+    """
+    names, pictures = list[str](), list[Picture]()
     for row in rows:
+        for column in row:
+            check_choice("column", column, columns)
         stems = (stem_of(Path(row[name])) for name in FILES if name in row)
         names.append(row.get("name") or next(stems, stem_of(row.get("text", ""))))
         if Path(names[-1]).is_absolute() or ".." in Path(names[-1]).parts:
             raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
-    pictures = []
     for name, row in zip(unique(names), rows, strict=True):
-        inputs = {column: row[column] for column in OWN if column in row}
-        settings = {column: row[column] for column in options.SETTABLE if column in row}
-        pictures.append(Picture(inputs, output / f"{name}.png", check_integer("seed", row["seed"], 0, 2**32), settings))
+        own = {column: row[column] for column in COLUMNS if column in row}
+        inputs = {column: str(folder.absolute() / cell) if column in FILES else cell for column, cell in own.items()}
+        seed = check_integer("seed", options.value_of(row["seed"]), 0, 2**32)
+        pictures.append(Picture(inputs, output / f"{name}.png", seed, settings))
     return pictures
 
 
-# Making it ------------------------------------------------------------------------------------------------------------
-
-
-def calls_of(pictures: Sequence[Picture], size: int) -> list[list[Picture]]:
-    """Pictures that one call makes: of the same settings, and of the same kinds of inputs."""
-    alike: dict[str, list[Picture]] = {}
+def calls_of(pictures: Sequence[Picture], most: int) -> list[list[Picture]]:
+    """Pictures that one call makes: of the same kinds of inputs."""
+    alike: dict[tuple[str, ...], list[Picture]] = {}
     for one in pictures:
-        alike.setdefault(json.dumps([sorted(one.inputs), one.settings]), []).append(one)
-    calls = []
-    for group in alike.values():
-        most = 1 if "tolerance" in group[0].settings else size  # the samples of a call choose its steps together
-        calls += [group[start : start + most] for start in range(0, len(group), most)]
-    return calls
+        alike.setdefault(tuple(one.inputs), []).append(one)
+    return [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
 
 
 def make(pipe: Any, call: list[Picture]) -> "list[tuple[Image.Image | None, dict[str, Any]]]":

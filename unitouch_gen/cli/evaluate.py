@@ -12,7 +12,7 @@ from typer import Argument, Option, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.data import BGR, Materials, Pattern, layout_of
+from unitouch_gen.cli.data import Materials, names_of
 from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
 
@@ -48,7 +48,7 @@ def evaluate(
     data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
     kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
     sensor: Annotated[str | None, Option(help="Sensor of all touches of the data sets.")] = None,
-    materials: Materials = None, pattern: Pattern = None, bgr: BGR = False,
+    materials: Materials = None,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
@@ -67,8 +67,8 @@ def evaluate(
 
     if output is not None:
         options.check_output([output / f"{name}.json" for name in names], overwrite)
-    layout = layout_of(materials, pattern)
-    folders = [open_dataset(folder, kind, sensor=sensor, bgr=bgr, **layout) for folder in data or ()]
+    labels = names_of(materials)
+    folders = [open_dataset(folder, kind, sensor=sensor, materials=labels) for folder in data or ()]
     pipes = {name: load_pipeline(PIPELINES[name], model=model, device=device) for name in names if name in PIPELINES}
     joint, processor = load_joint_space(model, device)
     for name in tuple(names):
@@ -86,10 +86,10 @@ def evaluate(
         else:
             known = [name for name in NAMED if name in joint.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
-        made, images = figures_of(names, sets, joint, processor, pipes, each, judge)
+        made = figures_of(names, sets, joint, processor, pipes, each, judge)
     facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
     for name, rows in made.items():
-        show(name, rows, facts, output, images.get(name))
+        show(name, rows, facts, output)
     if output is not None:
         echo(f"The tables are in {output.resolve()}")
 
@@ -156,8 +156,8 @@ def figures_of(
     pipes: Mapping[str, Any],
     each: int,
     judge: Path | None = None,
-) -> tuple[dict[str, Figures], dict[str, Any]]:
-    """Figures of each table, and images that were made for it."""
+) -> dict[str, Figures]:
+    """Figures of each table."""
     import torch
 
     from unitouch_gen import weights
@@ -174,7 +174,7 @@ def figures_of(
     asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
     drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     made: dict[str, Figures] = {name: {} for name in names}
-    images, drawn = dict[str, Any](), set[tuple[str, str, int]]()
+    drawn = set[tuple[str, str, int]]()
     for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
         for name in names:
@@ -188,23 +188,18 @@ def figures_of(
                 drawable(name, pipes[name], one) for one in splits["test"].sensors
             ):
                 drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
-                found, shown = drawing[name](pipes[name], splits, judges, each, seed)
-                images.setdefault(name, shown)
+                found = drawing[name](pipes[name], splits, judges, each, seed)
             else:
                 continue
             for row, values in found.items():
                 columns = made[name].setdefault(row if name in asking else f"{row}, {domain}", {})
                 for column, value in values.items():
                     columns.setdefault(column, []).append(value)
-    return made, images
+    return made
 
 
-def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None, images: Any) -> None:
-    """Prints a table, and writes NAME.json, NAME.md and a grid NAME.png of images."""
-    from diffusers.utils import make_image_grid, numpy_to_pil
-    from torch import stack
-    from torch.nn.functional import interpolate
-
+def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None) -> None:
+    """Prints a table, and writes NAME.json and NAME.md."""
     from unitouch_gen.files import write_file
 
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
@@ -222,9 +217,4 @@ def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None
     write_file("--output", output / f"{name}.json", json.dumps({"table": name, "rows": rows, **facts}, indent=2) + "\n")
     cells = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
     page = [f"## {TABLES[name]}", "", *cells, "", f"Means over worlds, in brackets their spread. {facts}"]
-    if images:
-        tiles = stack([interpolate(part[:12].float(), (128, 128)) for part in images.values()], dim=1)
-        grid = make_image_grid(numpy_to_pil(tiles.flatten(0, 1).movedim(1, -1).numpy()), *tiles.shape[:2])
-        grid.save(output / f"{name}.png")
-        page += ["", f"From left to right: {', '.join(images)}.", "", f"![examples]({name}.png)"]
     write_file("--output", output / f"{name}.md", "\n".join(page) + "\n")

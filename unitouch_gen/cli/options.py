@@ -3,7 +3,6 @@
 import inspect
 import json
 import os
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -65,13 +64,11 @@ def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
 
 
 def value_of(word: str) -> Any:
-    """A number, a list, true or false, as in JSON or as spreadsheets write them; any other word is a text."""
-    plain = word.lower() if word in ("TRUE", "FALSE", "True", "False") else re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", word)
+    """A number, a list, true or false, as in JSON; any other word is a text."""
     try:
-        value = json.loads(plain)
+        return json.loads(word)
     except ValueError:
         return word
-    return int(value) if isinstance(value, float) and value.is_integer() else value  # 3.0: of a column with blanks
 
 
 def check_output(files: Sequence[Path], overwrite: bool) -> None:

@@ -22,8 +22,8 @@ MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "to
 
 def touch_to_image_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
-) -> tuple[dict[str, Figures], dict[str, Tensor]]:
-    """Table 5: measures of pictures of the test split's touches, with their controls; and K of each, (K, 3, H, W).
+) -> dict[str, Figures]:
+    """Table 5: measures of pictures of the test split's touches, with their controls.
 
     Controls are pictures of the mean touch of a class and of another contact, and the real picture of the nearest touch
     of the training split. The ceiling is the real picture, which the world shows under another lamp. Measures are
@@ -35,25 +35,20 @@ def touch_to_image_table(
     made = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
     nearest = cosines(test.features["touch"][rows], train.features["touch"]).argmax(dim=1)
     made["real one of the nearest known touch"] = float_pixels(train.image[nearest.numpy()])
-    real = float_pixels(test.image[rows.numpy()])
-    made["ceiling"] = real if test.relit is None else test.relit()[rows]
-    figures = with_controls(measures_of(splits, classifiers, "image", rows), made)
-    return figures, {"touch": float_pixels(test.touch[rows.numpy()]), "real": real, **made}
+    made["ceiling"] = float_pixels(test.image[rows.numpy()]) if test.relit is None else test.relit()[rows]
+    return with_controls(measures_of(splits, classifiers, "image", rows), made)
 
 
-def x_to_touch_table(
-    pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
-) -> tuple[dict[str, Figures], dict[str, Tensor]]:
+def x_to_touch_table(pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int) -> dict[str, Figures]:
     """Section 4.8: the same of touches made of pictures, captions, sounds and touches by another sensor.
 
     The ceiling is the real touch, which the world shows by another sensor.
     """
     test, figures = splits["test"], dict[str, Figures]()
     rows = some(test, each)
-    real = float_pixels(test.touch[rows.numpy()])
-    ceiling = real if test.second is None else float_pixels(test.second[rows.numpy()])
+    ceiling = float_pixels((test.touch if test.second is None else test.second)[rows.numpy()])
     measure = measures_of(splits, classifiers, "touch", rows)
-    sensors, images = [test.sensors[row] for row in rows.tolist()], {"real touch": real}
+    sensors = [test.sensors[row] for row in rows.tolist()]
     inputs = {"image": test.image, "touch": test.second, "audio": test.sounds, "text": test.text or None}
     for modality in [name for name in pipe.unitouch.known_modalities if inputs[name] is not None]:
         values: Any = inputs[modality]() if modality == "audio" else inputs[modality]
@@ -61,8 +56,7 @@ def x_to_touch_table(
         made = {name: generate(pipe, seed, {"condition_embeds": e, "sensor": sensors}) for name, e in embeds.items()}
         measured = with_controls(measure, {**made, "ceiling": ceiling})
         figures |= {f"{MADE_OF[modality]}: {name}": row for name, row in measured.items()}
-        images[MADE_OF[modality]] = made["value"]
-    return figures, images
+    return figures
 
 
 def some(contacts: Contacts, each: int) -> Tensor:

@@ -1,11 +1,9 @@
 """Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference"), and sensors in files of their own."""
 
-import copy
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -60,19 +58,12 @@ class SensorBank(nn.Module):
     ):  # fmt: skip
         super().__init__()
         self.names, self.prototype_size, self.reaches = tuple(names), prototype_size, dict(reaches or {})
-        self.encoders: dict[str, nn.Module] = {}  # of added sensors that bring their own; not in the state dict
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
         self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))  # which have a prototype
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `to` and the like are made of: takes the encoders of added sensors along."""
-        for encoder in self.encoders.values():
-            encoder._apply(fn)
-        return super()._apply(fn, recurse)
 
     def index(self, name: str) -> int:
         """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
@@ -135,13 +126,12 @@ class SensorBank(nn.Module):
 
     def encode(self, encoder: Callable[..., Tensor], pixels: Tensor, indices: Tensor) -> Tensor:
         """An encoder's output for pixel values with the tokens of their sensors, (B, ...); index -1 has none."""
-        rows_of: dict[tuple[Callable[..., Tensor], bool], list[int]] = {}
+        rows_of: dict[bool, list[int]] = {}
         for row, index in enumerate(indices.tolist()):
-            name = self.names[index] if index >= 0 and self.names else None
-            rows_of.setdefault((self.encoders.get(name or "", encoder), name is not None), []).append(row)
+            rows_of.setdefault(index >= 0 and bool(self.names), []).append(row)
         parts, order = [], list[int]()
-        for (network, has_tokens), rows in rows_of.items():
-            parts.append(network(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
+        for has_tokens, rows in rows_of.items():
+            parts.append(encoder(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
             order += rows
         return torch.cat(parts)[torch.tensor(order).argsort()]
 
@@ -152,7 +142,6 @@ class SensorBank(nn.Module):
         _, count, width = self.tokens.shape
         bank = SensorBank([self.names[row] for row in rows], count, width, self.prototype_size, reaches)
         bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[rows], self.prototypes[rows], self.known[rows]
-        bank.encoders = {other: encoder for other, encoder in self.encoders.items() if other != name}
         return bank.requires_grad_(self.tokens.requires_grad)
 
     def with_added(self, sensor: "AddedSensor", encoder: nn.Module) -> "SensorBank":
@@ -164,9 +153,7 @@ class SensorBank(nn.Module):
         try:
             bank.tokens.data = torch.cat([bank.tokens.data, sensor.tokens[None].to(bank.tokens)])
             bank.prototypes = torch.cat([bank.prototypes, sensor.prototype.flatten()[None].to(bank.prototypes)])
-            if sensor.lora:
-                bank.encoders[sensor.name] = sensor.encoder(encoder)
-        except (KeyError, AttributeError, RuntimeError) as error:  # half of an update, or other sizes
+        except RuntimeError as error:  # other sizes
             raise InvalidInputError(f"{brought}, which does not fit ({first_line(error)}); adapt it anew.") from error
         if bank.reaches:
             bank.reaches[sensor.name] = max(bank.reaches.values()) if sensor.reach is None else sensor.reach
@@ -175,8 +162,6 @@ class SensorBank(nn.Module):
 
 
 # Sensors that were added ----------------------------------------------------------------------------------------------
-
-DOWN, UP = ".lora_A.weight", ".lora_B.weight"  # ends of the names of low-rank updates, as peft has them
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +173,6 @@ class AddedSensor:
         base: `fingerprint` of the touch encoder that it was made for.
         tokens: (L, width); L is 0 for an encoder without sensor tokens.
         prototype: Mean raw image, in [0, 1], (3, S, S).
-        lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
-            and `DOWN` (r, in) or `UP` (out, r); the scale is in them.
-        figures: What was measured of it.
         reach: As in `SensorBank.reaches`; the widest of the others' if left out.
     """
 
@@ -198,15 +180,13 @@ class AddedSensor:
     base: Tensor
     tokens: Tensor
     prototype: Tensor
-    lora: Mapping[str, Tensor] = field(default_factory=dict)
-    figures: Mapping[str, Any] = field(default_factory=dict)
     reach: float | None = None
 
     def save(self, file: Path) -> None:
         """Writes it in half precision; raises an `InvalidInputError` if the file cannot be written."""
-        parts = {"tokens": self.tokens, "prototype": self.prototype, **self.lora}
+        parts = {"tokens": self.tokens, "prototype": self.prototype}
         tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
-        metadata = {"kind": "unitouch sensor 1", "name": self.name, "figures": json.dumps(dict(self.figures))}
+        metadata = {"kind": "unitouch sensor 1", "name": self.name}
         metadata |= {} if self.reach is None else {"reach": repr(self.reach)}
         write_file("output", file, save({**tensors, "base": self.base}, metadata))
 
@@ -219,22 +199,13 @@ class AddedSensor:
                 known = stored.metadata() or {}
                 tensors = {key: check_finite(key, stored.get_tensor(key).float()) for key in stored.keys()}  # noqa: SIM118
             base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
-            reach = float(known["reach"]) if "reach" in known else None
-            return cls(known["name"], base, tokens, prototype, tensors, json.loads(known["figures"]), reach)
+            if tensors:
+                raise ValueError(f"it holds {next(iter(tensors))}, an update of the encoder; adapt the sensor anew")
+            return cls(known["name"], base, tokens, prototype, float(known["reach"]) if "reach" in known else None)
         except (OSError, ValueError, KeyError, SafetensorError) as error:
             raise InvalidInputError(
                 f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass what `adapt` wrote."
             ) from error
-
-    @torch.no_grad()
-    def encoder(self, base: nn.Module) -> nn.Module:
-        """A copy of the touch encoder with the updates in its weights, W + B A."""
-        encoder = copy.deepcopy(base)
-        for key in self.lora:
-            if key.endswith(DOWN):
-                weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
-                weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
-        return encoder
 
 
 def fingerprint(encoder: nn.Module) -> Tensor:

@@ -22,7 +22,7 @@ from unitouch_gen.world.grids import PATCH_MM
 from unitouch_gen.world.materials import MATERIALS
 
 OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)  # first numbers of the streams' names
-SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM, GRASP_STREAM = range(4, 8)
+SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM = range(4, 7)
 
 MODES = 14  # partials of each object's sound
 

@@ -23,14 +23,14 @@ from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
-from unitouch_gen.world.grasps import Outcome, grasp_margin, outcome_captions, outcome_pictures
+from unitouch_gen.world.grasps import grasp_margin
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
 from unitouch_gen.world.surfaces import pictures, surfaces
 
-MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes")
+MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
 
 YIELD = 0.75  # share of an overlap that an object as compliant as the gel takes up: it is flattened
 
@@ -48,7 +48,6 @@ class Scene:
     audio: Tensor | None = None  # impact sounds in [-1, 1] at 16 kHz, (N, T)
     text: list[str] | None = None  # N captions
     grasp: Tensor | None = None  # force that two fingers carry over the object's weight, (N,): above 1 they lift it
-    outcome: Outcome | None = None  # pictures and captions of what came of the grasps
     attributes: dict[str, Tensor] = field(default_factory=dict)  # by sensor, (N, 13); see `ATTRIBUTES`
     left_out: list[str] = field(default_factory=list)  # what the request did not need and was not computed
 
@@ -91,9 +90,9 @@ class World:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
-            modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes".
-            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes, and for grasp and
-                outcome, which use the first.
+            modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "attributes".
+            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes, and for grasp, which uses
+                the first.
 
         Raises:
             InvalidTypeError: If names of contacts are no integers, modalities or sensors no list.
@@ -104,12 +103,11 @@ class World:
         by, material = _sensors(sensors), _numbers("material", material, most=len(MATERIALS) - 1)
         object, contact = _numbers("object", object, len(material)), _numbers("contact", contact, len(material))
         draws, scene = self.draw(material, object, contact), Scene(material, object, contact)
-        needed = asked | ({"image", "grasp"} if "outcome" in asked else set())  # outcomes show the skins of objects
-        scene.left_out = [name for name in MODALITIES if name not in needed]
+        scene.left_out = [name for name in MODALITIES if name not in asked]
 
         # 2. Surfaces and their pictures.
-        coloured, size = "image" in needed, self.image_size
-        if needed - {"audio", "text"}:
+        coloured, size = "image" in asked, self.image_size
+        if asked - {"audio", "text"}:
             built = surfaces(self.seed, draws, self.resolution, coloured=coloured)
             # Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
             stiff = 1.0 - YIELD * draws.compliance
@@ -118,8 +116,7 @@ class World:
         else:
             scene.left_out.append("surfaces")
         if coloured:
-            picture = pictures(built, draws.light, draws.gloss, draws.white, draws.camera, size)
-            scene.image = picture if "image" in asked else None
+            scene.image = pictures(built, draws.light, draws.gloss, draws.white, draws.camera, size)
 
         # 3. Gels.
         for sensor in by if asked & {"touch", "depth", "attributes"} else ():
@@ -136,14 +133,10 @@ class World:
                 )
 
         # 4. Grasps, sounds and captions.
-        if "grasp" in needed:
+        if "grasp" in asked:
             touched = in_view(gel_indentation(height, depth, by[0], size), size) > 0
             share = touched.float().mean(dim=(-2, -1))
-            margin = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
-            scene.grasp = margin if "grasp" in asked else None
-        if "outcome" in asked:
-            image = outcome_pictures(self.seed, draws, picture, margin > 1.0)
-            scene.outcome = Outcome(image, outcome_captions(draws, margin > 1.0))
+            scene.grasp = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
         if "audio" in asked:
             scene.audio = recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
         if "text" in asked:

@@ -64,7 +64,6 @@ def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(
         np.testing.assert_allclose(split.touch[row] / 255.0, touch, atol=0.5 / 255 + 1e-6)
         np.testing.assert_allclose(split.audio[row], sound, rtol=1e-3, atol=1e-3)
         assert split.text[row] == f"n{number}"
-    np.testing.assert_array_equal(split.thinned(3).touch, split.touch[[0, 2, 4]])
 
 
 def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, processor: UniTouchProcessor) -> None:
@@ -143,15 +142,6 @@ def test_splits_by_objects_are_disjoint_whole_and_do_not_depend_on_the_order(cou
     for by in ("official", "recording"):
         with pytest.raises(InvalidInputError, match=rf"`split` is '{by}', but Data set .* and no 'train'"):
             data.split("train", by)
-
-
-@pytest.mark.parametrize("split", ["object", "none"])
-def test_what_is_held_out_is_not_trained_on(folder: Path, split: str) -> None:
-    data = DataConfig(sets=[{"path": str(folder), "split": split}])
-    trained = {record.object for part in data.sources() for record in part.records}
-    held = data.held_out(3)
-    assert all(1 < len(part) <= 3 and not trained & {r.object for r in part.records} for part in held)
-    assert bool(held) == (split == "object")
 
 
 def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path, joint: str) -> None:

@@ -48,11 +48,11 @@ def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cac
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Twelve touches of six objects with their untouched gel, of two hardnesses."""
-    rng, rows = np.random.default_rng(0), ["clip,object,hardness,caption"]
+    rng, rows = np.random.default_rng(0), ["touch,background,object,hardness,caption"]
     for number in range(12):
         for kind in ("peak", "bg"):
             Image.fromarray(rng.integers(0, 255, (32, 32, 3), dtype=np.uint8)).save(tmp_path / f"{number}_{kind}.png")
-        rows.append(f"{number},thing{number // 2},{number // 2 % 2},a thing of {number}")
+        rows.append(f"{number}_peak.png,{number}_bg.png,thing{number // 2},{number // 2 % 2},a thing of {number}")
     (tmp_path / "labels.csv").write_text("\n".join(rows))
     return tmp_path
 
@@ -60,7 +60,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp_path):
     for sensor in model.sensors:
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3))
-    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png", "background": "{clip}_bg.png"})
+    data = open_dataset(folder)
     [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
     assert not known and [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
     test, record = splits["test"], parts_of(data)["test"].records[1]
@@ -74,7 +74,7 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp
 
 
 def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folder):
-    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png"})
+    data = open_dataset(folder)
     records = [replace(one, split="train" if one.object < "thing4" else "test") for one in data.records]
     parts = parts_of(replace(data, records=tuple(records)))
     objects = [{record.object for record in parts[split].records} for split in SPLITS]
