@@ -77,8 +77,6 @@ class RunReport:
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)
-    chosen: list[int] = field(default_factory=list)  #: indices of the samples chosen among candidates
-    scores: list[float] = field(default_factory=list)  #: cosine of each chosen sample's embedding to the condition
     left_out: list[str] = field(default_factory=list)  #: parts that were not needed and did not run
 
     @property
