@@ -159,16 +159,15 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return self.config[f"default_{name}"] if value is None else value
 
     def _check_steps(
-        self, num_inference_steps: Any, timesteps: Any, sigmas: Any, solver: Any, tolerance: Any, max_evaluations: Any,
-        eta: Any, init_strength: float = 1.0,
+        self, num_inference_steps: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any,
+        init_strength: float = 1.0,
     ) -> Steps:  # fmt: skip
         """Validated steps, by default the checkpoint's number; see `prepare_steps`."""
-        if timesteps is None and sigmas is None and tolerance is None:
+        if tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         return prepare_steps(
-            self.scheduler, num_inference_steps=num_inference_steps, timesteps=timesteps, sigmas=sigmas, solver=solver,
-            tolerance=tolerance, max_evaluations=max_evaluations, eta=eta, init_strength=init_strength,
-            device=self._execution_device,
+            self.scheduler, num_inference_steps=num_inference_steps, solver=solver, tolerance=tolerance,
+            max_evaluations=max_evaluations, eta=eta, init_strength=init_strength, device=self._execution_device,
         )  # fmt: skip
 
     def _check_guidance(self, scale: float | None) -> Guidance:

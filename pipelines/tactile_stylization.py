@@ -96,7 +96,6 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         touch_weight: float | Sequence[float] | None = None, image_weight: float | None = None, mix: str = "linear",
         layout: int | None = 12, keep_colours: bool = False, init_strength: float = 1.0,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         strength: float = 1.0, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
@@ -156,7 +155,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(
-                num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta, init_strength
+                num_inference_steps, solver, tolerance, max_evaluations, eta, init_strength
             ),
             guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),

@@ -164,7 +164,6 @@ class XToTouchPipeline(UniTouchPipeline):
         touch: ImageInput = None, sensor: SensorNames = None, background: ImageInput = None,
         weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         num_images_per_prompt: int = 1,
         sampling_rate: int | None = None, source_sensor: SensorNames = None,
@@ -223,7 +222,7 @@ class XToTouchPipeline(UniTouchPipeline):
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
+            steps=self._check_steps(num_inference_steps, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,

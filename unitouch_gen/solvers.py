@@ -38,7 +38,10 @@ def sample_ddim(
     eta: float = 0.0,
     draw: Callable[[Tensor], Tensor] = torch.randn_like,
 ) -> Tensor:
-    """DDIM, of order 1; at eta = 1 it adds as much noise as DDPM (Song et al., 2021, Equations 12 and 16)."""
+    """DDIM, of order 1; at eta = 1 it adds as much noise as DDPM (Song et al., 2021, Equations 12 and 16).
+
+    At eta = 0 it is the method of Euler.
+    """
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         denoised = denoise(x, sigma)
         added = eta * target * math.sqrt(1 - (target / sigma) ** 2)
@@ -46,14 +49,6 @@ def sample_ddim(
         if added > 0.0:
             x = x + added * draw(x)
         x = after_step(step, x, target)
-    return x
-
-
-def sample_euler(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """Euler, of order 1 (the first half of Algorithm 1 of Karras et al., 2022)."""
-    for step, (sigma, target) in enumerate(pairwise(sigmas)):
-        slope = (x - denoise(x, sigma)) / sigma
-        x = after_step(step, x + (target - sigma) * slope, target)
     return x
 
 
@@ -239,7 +234,7 @@ class Solver:
 SOLVERS: dict[str, Solver] = {
     "ddim": Solver(sample_ddim, 1, NoiseSchedule.trailing),
     # Levels even in time are too far apart near the end, which limits multistep solvers to first order.
-    "euler": Solver(sample_euler, 1, NoiseSchedule.karras),
+    "euler": Solver(sample_ddim, 1, NoiseSchedule.karras),
     "heun": Solver(sample_heun, 2, NoiseSchedule.karras),
     "dpm++2m": Solver(sample_dpmpp_2m, 2, NoiseSchedule.karras),
     "unipc": Solver(sample_unipc, 3, NoiseSchedule.karras),
