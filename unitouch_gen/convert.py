@@ -295,8 +295,6 @@ def convert_published(
 ) -> None:
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
-    A folder that holds other encoders of the same sizes is added to.
-
     Args:
         output: The folder.
         touch, imagebind, config, dtype, log_fn: See `read_published`.
@@ -309,27 +307,13 @@ def convert_published(
     output = as_path("output", output)
     words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
     model = read_published(touch, imagebind, config=config, dtype=dtype, log_fn=log_fn)
-    if (output / "model_index.json").exists():
-        raise InvalidInputError(f"`output` is {str(output)!r}, which holds a pipeline; name another folder.")
-    if (output / "config.json").exists():
-        _add_encoders_of(output, model)
+    if any((output / file).exists() for file in ("model_index.json", "config.json")):
+        raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
-    if not words and not (output / "tokenizer_config.json").is_file():
+    if not words:
         lacks.append("a tokenizer, which `tokenizer` would bring")
     with writing_folder("output", output) as folder:
         model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
     log_fn(f"Missed: {'; '.join(lacks)}")
-
-
-def _add_encoders_of(folder: Path, model: UniTouchModel) -> None:
-    """Adds the encoders that a folder holds and a model lacks; raises if it holds a joint space of other sizes."""
-    known = UniTouchModel.from_pretrained(folder, dtype=model.dtype)
-    ours, theirs = model.config.to_dict(), known.config.to_dict()
-    if any(theirs[name] != ours[name] for name in ours if name.endswith("_config")) or known.config.sensors:
-        raise InvalidInputError(f"`output` is {str(folder)!r}, which holds another model; name another folder.")
-    for modality in set(known.known_modalities) - set(model.loaded_modalities):
-        for name, module in zip(MODULES[modality], known.load(modality), strict=True):
-            setattr(model, name, module)
-    model.config.embedding_norm = known.config.embedding_norm
