@@ -49,7 +49,7 @@ TO_IMAGE = {
 }  # fmt: skip
 STYLIZE = {
     "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
-    "touch_weight": ([1.2, -0.1, NAN, [0.1] * 3], ["much"]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
+    "touch_weight": ([1.2, -0.1, NAN], ["much", [0.1] * 3]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
     "init_strength": ([1.5, -0.1, NAN], ["much"]),
 }  # fmt: skip
 TO_TOUCH = {
