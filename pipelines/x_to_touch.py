@@ -135,13 +135,12 @@ class XToTouchPipeline(UniTouchPipeline):
         *,
         weights: Mapping[str, float] | None = None,
         bridge: bool | None = None,
-        sampling_rate: int | None = None,
         source_sensor: SensorNames = None,
     ) -> Tensor:
         """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions, _ = self._prepare(given, weights, sampling_rate, source_sensor)
+        conditions, _ = self._prepare(given, weights, source_sensor)
         return self._condition(conditions, bridge, RunReport())
 
     def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
@@ -165,8 +164,7 @@ class XToTouchPipeline(UniTouchPipeline):
         weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         guidance_scale: float | None = None,
-        num_images_per_prompt: int = 1,
-        sampling_rate: int | None = None, source_sensor: SensorNames = None,
+        num_images_per_prompt: int = 1, source_sensor: SensorNames = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
         generator: Generators = None, latents: Tensor | None = None, condition_embeds: Tensor | None = None,
         output_type: str = "pil", return_dict: bool = True,
@@ -191,7 +189,6 @@ class XToTouchPipeline(UniTouchPipeline):
                 embeddings). Default: if a bank is present.
             num_inference_steps, guidance_scale: See there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
-            sampling_rate: Rate of sounds that are arrays without one, Hz.
             source_sensor: Sensor that took `touch`: a name, one for each, or `None` to retrieve it.
             generator: One, or one for each touch image.
             latents: Unit-variance noise (B n, C, h, w), n touch images of each input.
@@ -211,10 +208,10 @@ class XToTouchPipeline(UniTouchPipeline):
         conditions: Conditions = {}
         if condition_embeds is None:
             bridge = self._check_bridge(bridge)
-            conditions, inputs = self._prepare(given, weights, sampling_rate, source_sensor)
+            conditions, inputs = self._prepare(given, weights, source_sensor)
         else:
             embeds = check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
-            given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
+            given |= {"weights": weights, "source_sensor": source_sensor}
             check_unused("condition_embeds", **given, bridge=bridge or None)
             inputs = len(embeds)
         gels, sensor_labels = self._check_sensor(sensor, background, inputs)
@@ -270,7 +267,6 @@ class XToTouchPipeline(UniTouchPipeline):
         self,
         given: Mapping[str, Any],
         weights: Mapping[str, float] | None,
-        sampling_rate: int | None,
         source_sensor: SensorNames,
     ) -> tuple[Conditions, int]:
         """Reads the given modalities; also returns the number of inputs, B."""
@@ -280,8 +276,6 @@ class XToTouchPipeline(UniTouchPipeline):
         self._joint(next(iter(given)))
         if source_sensor is not None and "touch" not in given:
             raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
-        if sampling_rate is not None and "audio" not in given:
-            raise InvalidInputError("`sampling_rate` has no effect without `audio`; leave it out.")
         inputs: dict[str, Any] = {}
         if "image" in given:
             inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
@@ -291,7 +285,7 @@ class XToTouchPipeline(UniTouchPipeline):
                     raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
             inputs["text"] = dict(self.processor.text(given["text"]))
         if "audio" in given:
-            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
+            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], audible=True)}
         if "touch" in given:
             inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
         sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]

@@ -1,29 +1,25 @@
-"""Fits what a joint space does not know: which touches are unlike those of its training, and how sure its names are.
+"""Fits what a joint space does not know: which touches are unlike those of its training.
 
     python -m unitouch_gen.training.abstention --joint runs/family/joint --cache runs/cache
 
-Statistics are of what it was trained on, temperatures and the threshold of what was held out. No weight changes.
+Statistics are of what it was trained on, the threshold of what was held out. No weight changes.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from safetensors import safe_open
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 from typer import Option
 
-from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance
 from unitouch_gen.models.sensors import layout_distances
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, material_names
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of
 from unitouch_gen.training.recipe import read, read_recipe
 from unitouch_gen.training.stages import run_command
 from unitouch_gen.world import ATTRIBUTES
@@ -58,15 +54,6 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
     return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
 
 
-def fit_temperature(scores: Tensor, labels: Tensor) -> float:
-    """Temperature of the softmax of scores (N, C) with the least negative log-likelihood (Guo et al., 2017)."""
-
-    def loss(log_temperature: float) -> float:
-        return F.cross_entropy(scores.double() / math.exp(log_temperature), labels).item()
-
-    return math.exp(minimize_scalar(loss, bounds=(-12.0, 12.0), method="bounded").x)
-
-
 def fit_distance(model: UniTouchModel, processor: UniTouchProcessor, train: Splits, held: Splits, share: float) -> None:
     """Fits the distance of touches, and the threshold that a share of held-out touches is beyond."""
 
@@ -97,17 +84,6 @@ def fit_reaches(model: UniTouchModel, held: Splits, share: float) -> None:
     bank.reaches = dict(model.config.sensor_reaches)
 
 
-@torch.no_grad()
-def fit_temperatures(model: UniTouchModel, processor: UniTouchProcessor, held: Splits, names: Sequence[str]) -> None:
-    """Fits a temperature of each modality."""
-    labels, model.config.temperatures = torch.from_numpy(np.concatenate([split.material for split in held])), {}
-    classifier = ZeroShotTouchClassifier(model, processor)
-    for modality in MODALITIES:
-        encode = getattr(model, f"get_{modality}_features")
-        embeds = torch.cat([encode(part).float().cpu() for part in inputs_of(held, modality, processor)])
-        model.config.temperatures[modality] = fit_temperature(classifier.scores(embeds, modality, names), labels)
-
-
 def abstention(
     *,
     joint: Annotated[Path, Option(help="Folder of the joint space, such as `joint` of a family; it is written to.")],
@@ -126,7 +102,6 @@ def abstention(
     fit_distance(model, processor, train, held, share)
     if data.drawn is not None:  # an encoder that has seen touches without a sensor's tokens
         fit_reaches(model, held, share / 2)
-    fit_temperatures(model, processor, held, material_names(sources))
     with safe_open(next(joint.glob("model*.safetensors")), framework="pt") as stored:
         dtype = stored.get_tensor(next(key for key in stored.keys() if key.endswith("weight"))).dtype  # noqa: SIM118
     model.to(dtype).save_pretrained(joint)  # type: ignore[arg-type]

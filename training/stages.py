@@ -232,7 +232,7 @@ def save_modalities(
 ) -> None:
     """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
     config = deepcopy(model.config)
-    for name in ("ood_thresholds", "temperatures", "sensor_reaches"):
+    for name in ("ood_thresholds", "sensor_reaches"):
         setattr(config, name, {})  # they were measured of other weights
     config.save_pretrained(folder)
     processor.save_pretrained(folder)

@@ -164,7 +164,6 @@ def read_published(
             if not model.loaded_modalities:
                 model.to(wanted or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
-            _check_range(name, model, modality)
         log_fn(f"Used of {path.name}: {counted(used)}")
         if ignored := keys.keys() - used:
             log_fn(f"Ignored of {path.name}: {counted(ignored)}")
@@ -199,15 +198,6 @@ def _encoder_in(
         bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
         found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
     return found
-
-
-def _check_range(name: str, model: UniTouchModel, modality: str) -> None:
-    """Refuses a dtype in which weights became infinite."""
-    for key, weight in getattr(model, MODULES[modality][0]).named_parameters():
-        if not bool(weight.isfinite().all()):
-            raise InvalidInputError(
-                f"`dtype` is {model.dtype}, in which {key} of `{name}` overflows; use torch.bfloat16."
-            )
 
 
 class Inert:

@@ -39,8 +39,8 @@ def files_of(folder: Path, tokenizer: Any, legacy: bool) -> tuple[dict[str, Tens
     def random(*shape: int, scale: float = 0.3) -> Tensor:
         return scale * torch.randn(shape, generator=generator)
 
-    llama = {"tok_embeddings.weight": random(len(tokenizer), DIM, scale=1.0), "output.weight": random(len(tokenizer), DIM),
-             "norm.weight": 1 + random(DIM)}  # fmt: skip
+    llama = {"tok_embeddings.weight": random(len(tokenizer), DIM, scale=1.0),
+             "output.weight": random(len(tokenizer), DIM), "norm.weight": 1 + random(DIM)}  # fmt: skip
     bridge = {"image_bind_proj.weight": random(DIM, WIDTH), "image_bind_proj.bias": random(DIM),
               "prefix_query.weight": random(LAYERS, DIM), "llama.norm.weight": 1 + random(DIM)}  # fmt: skip
     for k in (1, 2, 3):

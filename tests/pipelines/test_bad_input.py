@@ -56,7 +56,7 @@ TO_TOUCH = {
     "text": (["  \n", ["brick", ""], []], [3]),
     "audio": ([(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
               []),
-    "sampling_rate": ([RATE], []), "source_sensor": (["digit"], []),
+    "source_sensor": (["digit"], []),
     "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []), "background": ([torch.zeros(3, 16, 16)], []),
     "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {3: 1}, {}], [[1.0]]),
     "bridge": ([], ["london", 1]), "condition_embeds": ([torch.ones(1, 1, 16)], []),

@@ -8,9 +8,8 @@ import torch
 from safetensors.torch import load_file
 from scipy.spatial.distance import mahalanobis
 
-from unitouch_gen.evaluation.metrics import calibration_error
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temperature
+from unitouch_gen.training.abstention import abstention, fit_gaussians
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import save_modalities
 
@@ -24,7 +23,7 @@ def space(model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, t
     return tmp_path / "space"
 
 
-def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_written_and_weights_stay(
+def test_a_distance_that_knows_touches_from_pictures_is_written_and_weights_stay(
     space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered
 ) -> None:
     before = load_file(space / "model.safetensors")
@@ -35,7 +34,6 @@ def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_writte
     new = {key: tensor for key, tensor in after.items() if key not in before}
     assert new and all(tensor.dtype == torch.float16 for tensor in new.values())
     again = UniTouchModel.from_pretrained(space)
-    assert set(again.config.temperatures) == {*MODALITIES}
     assert list(again.config.ood_thresholds) == ["touch"]
     assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
@@ -56,13 +54,3 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
     np.testing.assert_allclose(gaussians(torch.from_numpy(others)), expected, rtol=1e-3)
     halved = gaussians.half()(torch.from_numpy(others))
     np.testing.assert_allclose(halved, expected, rtol=0.05, atol=0.1)
-
-
-@pytest.mark.parametrize("unit", [0.3, 100.0])
-def test_the_temperature_that_labels_were_drawn_at_is_found(unit: float) -> None:
-    generator = torch.Generator().manual_seed(0)
-    scores = unit * (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0)
-    labels = torch.multinomial((scores / (0.2 * unit)).softmax(dim=1), 1, generator=generator)[:, 0]
-    found = fit_temperature(scores, labels)
-    assert found == pytest.approx(0.2 * unit, rel=0.05)
-    assert calibration_error((scores / found).softmax(dim=1), labels) < 0.01
