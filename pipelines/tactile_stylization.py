@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.conditioning import apply_strength, mix_linear, mix_to_norm
+from unitouch_gen.conditioning import mix_linear, mix_to_norm
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
@@ -193,7 +193,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         else:
             report.left_out.append("image encoder")
         stacked = torch.stack([part.expand(batch_size, -1) for part in parts])
-        return apply_strength(MIXES[mix](stacked, torch.tensor(shares).to(stacked)), strength)
+        return strength * MIXES[mix](stacked, torch.tensor(shares).to(stacked))
 
     def _check_mixture(self, touch_weight: float, image_weight: float | None) -> list[float]:
         """Weights of touches and photos, which sum to 1; that of photos defaults to the rest."""

@@ -20,7 +20,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_strength, noise_embeddings
+from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
@@ -286,7 +286,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> tuple[Tensor, Tensor]:
         """Embeddings (B, D) of touches, first as encoded, then with bridge and strength."""
         encoded = self._touch_embeds(touches, report, throw)
-        return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
+        return encoded, strength * (self.embedding_bank.bridge(encoded) if bridge else encoded)
 
     def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.

@@ -49,8 +49,10 @@ class ReturnCode(StrEnum):
     SUCCESS = "success", "The sample is finite."
     NON_FINITE = "non_finite", "Not finite. Lower `guidance_scale` or `strength`, take more steps, or run in float32."
     DIVERGED = "diverged", "Far larger than the latents of pictures. Lower `guidance_scale`, or take more steps."
-    MAX_EVALUATIONS = "max_evaluations", "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`."
-    STEP_TOO_SMALL = "step_too_small", "Unfinished. Allow a larger `tolerance`, lower `guidance_scale`, or use float32."
+    MAX_EVALUATIONS = (
+        "max_evaluations",
+        "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`.",
+    )
     INTERRUPTED = "interrupted", "Interrupted, with noise left in the sample. Call again to finish it."
 
     @property
@@ -318,7 +320,7 @@ def run_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -
     run.latents, run.sigma = x * alpha(sigma), sigma
     if steps.tolerance is not None:
         ends, active = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
-        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_rejection, active)
+        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, active)
     options: dict[str, Any] = {}
     if steps.solver == "ddim":
         options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
@@ -402,8 +404,3 @@ class Run:
         else:
             self.progress(1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last))
         return x
-
-    def after_rejection(self, step: float) -> None:
-        """Called after each rejected adaptive step with its size in log sigma."""
-        if step <= 1e-4:  # below it float32 cannot tell states apart
-            raise _EndedError(ReturnCode.STEP_TOO_SMALL)

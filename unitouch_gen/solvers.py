@@ -159,14 +159,13 @@ def sample_adaptive(
     ends: tuple[float, float],
     tolerance: float,
     after_step: AfterStep,
-    after_rejection: Callable[[float], object],
     active: Callable[[], Sequence[bool]],
 ) -> Tensor:
     """Adaptive steps from the first to the second of two sigmas, for a relative RMS tolerance of the result.
 
     A predictor of order 2 and a corrector of order 3 are an embedded pair: their difference is the local error. A step
     costs one evaluation, accepted or not. The whole batch shares its steps; the largest error of the `active` samples
-    decides. `after_rejection` gets the size in log sigma of a rejected step.
+    decides. Steps are at least 1e-4 in log sigma: below, float32 cannot tell states apart.
     """
     local_tolerance = 0.5 * tolerance  # errors partly cancel, and the corrector is better than the predictor
     (sigma, last), accepted, last_error = ends, 0, 1.0
@@ -180,9 +179,7 @@ def sample_adaptive(
         corrected = exponential_integral([*levels[-2:], ahead], sigma, target)
         error = local_error(corrected - predicted, *ahead, active()) / local_tolerance
         proposed = next_step(step, error, last_error, order=len(levels[-2:]) + 1)
-        if error > 1.0:
-            after_rejection(step)
-        else:
+        if error <= 1.0:
             levels.append(ahead)
             x = after_step(accepted, target / sigma * x + corrected, target)
             sigma, last_error, accepted = target, max(error, 1e-4), accepted + 1

@@ -125,19 +125,14 @@ class ZeroShotTouchClassifier:
             labels, template, top: See `__call__`.
             unknown: What `UniTouchModel.unknown_touches` says of each; nothing where it is empty.
         """
-        best = self.probabilities(features, modality, labels, template).topk(min(top or len(labels), len(labels)))
+        shares = (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
+        best = shares.topk(min(top or len(labels), len(labels)))
         rows = zip(best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True)
-        return [Named({labels[i]: p for i, p in zip(places, shares, strict=True)}, why) for places, shares, why in rows]
-
-    def probabilities(
-        self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
-    ) -> Tensor:
-        """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
-        return (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
+        return [Named({labels[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]
 
     def scores(
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
     ) -> Tensor:
-        """Cosines of embeddings with the labels in words, (B, labels)."""
+        """Cosines of embeddings with the labels in words, (B, labels); see `name` for the arguments."""
         texts = [(template or PROMPTS[modality]).format(label) for label in labels]
         return F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
