@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import UnfamiliarInputWarning
 
-UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
+UNLIKE = "unlike anything known"
 """Why a model abstains from naming a touch."""
 
 
