@@ -29,9 +29,6 @@ from unitouch_gen.models.sensors import SensorBank
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 """Which encoders are read from which file."""
 
-PUBLISHED_NAMES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
-"""The modalities, M, as the published files call them."""
-
 # The layout -----------------------------------------------------------------------------------------------------------
 
 Shape = tuple[int, ...]
@@ -115,7 +112,7 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
     short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats that of image and text
     for pattern, template, rule in RENAMINGS[modality]:
         if match := re.fullmatch(pattern, short):
-            return match.expand(template.replace("M", PUBLISHED_NAMES[modality], 1)), rule
+            return match.expand(template.replace("M", "vision" if modality == "image" else modality, 1)), rule
     raise KeyError(key)
 
 
