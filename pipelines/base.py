@@ -43,9 +43,10 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import as_path, local_folder, read_settings, reading, writing_folder
 from unitouch_gen.models.autoencoders import autoencoder_class, decode, encode, scale_factor
-from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
-from unitouch_gen.models.out_of_distribution import warn_of_unknown
+from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
+from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
+from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
 from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
 
@@ -105,10 +106,11 @@ class CallSettings:
 
 @dataclass(frozen=True)
 class Touches:
-    """Touches to encode: pixel values (B, 3, S, S), and the sensor of each."""
+    """Touches to encode: pixel values (B, 3, S, S), the sensor of each, and optional backgrounds."""
 
     pixels: Tensor
     matches: list[SensorMatch]
+    background: Tensor | None = None
 
 
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
@@ -216,19 +218,35 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     # From inputs to conditioning --------------------------------------------------------------------------------------
 
-    def _prepare_touch(self, touch: ImageInput, sensor: SensorNames) -> Touches:
-        """Touches with their sensors."""
+    def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
+        """Touches with their sensors and, if given, backgrounds."""
         model = self._joint("touch")
         pixels = self.processor.touch(touch)
-        return Touches(pixels, model.match_sensors(pixels, sensor))
+        if background is None:
+            return Touches(pixels, model.match_sensors(pixels, sensor))
+        backgrounds = self.processor.images(background, name="background")
+        if len(backgrounds) not in (1, len(pixels)):
+            raise InvalidInputError(
+                f"`background` holds {len(backgrounds)} images for {len(pixels)} touches; pass one, or one each."
+            )
+        backgrounds = backgrounds.expand_as(pixels)
+        matches = model.match_sensors(backgrounds, sensor, nearest=True)
+        if matches[0].name is None:
+            raise InvalidInputError("`background` was given, but this model has no sensor prototypes; leave it out.")
+        return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
-        """Embeddings (B, D) of touches; warns of those that are out of distribution."""
-        model = self.unitouch
-        features = model.get_touch_features(touches.pixels, model.sensor_ids(touches.matches))
+        """Embeddings (B, D) of touches; warns of those that are out of distribution or untouched."""
+        model, pixels, background = self.unitouch, touches.pixels, touches.background
+        if background is not None:
+            pixels = model.recentre(pixels, background, touches.matches)
+        features = model.get_touch_features(pixels, model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
-        reasons = model.unknown_touches(touches.pixels)
+        reasons = model.unknown_touches(pixels) or [None] * len(pixels)
+        if background is not None:
+            untouched = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
+            reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
             warn_of_unknown(reasons, stacklevel=6)  # two methods and `torch.no_grad` above this one

@@ -87,7 +87,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         guidance_scale: float | None = None,
         strength: float = 1.0, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
-        sensor: SensorNames = None, bridge: bool | None = None,
+        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
         generator: Generators = None, latents: Tensor | None = None,
         prompt_embeds: Tensor | None = None, negative_prompt_embeds: Tensor | None = None,
@@ -139,7 +139,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         for name, value in (("image", image), ("touch", touch)):
             if value is None:
                 raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
-        touches, photos = self._prepare_touch(touch, sensor), self.processor.images(image)
+        touches, photos = self._prepare_touch(touch, sensor, background), self.processor.images(image)
         sizes = (len(photos), len(touches.pixels))
         if min(sizes) not in (1, max(sizes)):
             raise InvalidInputError(f"`image` holds {sizes[0]} photos and `touch` {sizes[1]}; pass one, or one each.")

@@ -130,7 +130,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         guidance_scale: float | None = None,
         strength: float | None = None, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
-        sensor: SensorNames = None, bridge: bool | None = None,
+        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
         generator: Generators = None, latents: Tensor | None = None, touch_embeds: Tensor | None = None,
         prompt_embeds: Tensor | None = None, negative_prompt_embeds: Tensor | None = None,
@@ -151,6 +151,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             num_images_per_prompt: Pictures for each touch.
             noise_level: Noise level of the embedding, 0-999. More noise gives more variety.
             sensor: Sensor that took the touch: a name, one for each touch, or `None` to retrieve it.
+            background: Image of the untouched sensor, to recentre touches of an unknown sensor.
             bridge: Move touch embeddings to the nearest stored image embeddings (the UNet saw only image embeddings).
                 Default: if a bank is present.
             solver: A name in `unitouch_gen.sampling.SOLVERS`; `None` uses the pipeline's own scheduler.
@@ -188,7 +189,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             NotConvergedError: If a tolerance is not reached and `throw` is set.
 
         Warns:
-            UnfamiliarInputWarning: On touches out of distribution.
+            UnfamiliarInputWarning: On touches out of distribution, and on untouched gels.
         """
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
@@ -197,10 +198,10 @@ class TouchToImagePipeline(UniTouchPipeline):
         embeds: Any = touch_embeds
         if touch is None:
             check_tensor("touch_embeds", embeds, "B", self.embedding_dim)
-            check_unused("touch_embeds", strength=strength, sensor=sensor, bridge=bridge or None)
+            check_unused("touch_embeds", strength=strength, sensor=sensor, background=background, bridge=bridge or None)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
-        touches = None if touch is None else self._prepare_touch(touch, sensor)
+        touches = None if touch is None else self._prepare_touch(touch, sensor, background)
         batch_size = len(embeds if touches is None else touches.pixels)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
@@ -271,12 +272,13 @@ class TouchToImagePipeline(UniTouchPipeline):
         touch: ImageInput,
         sensor: SensorNames = None,
         strength: float | None = None,
+        background: ImageInput = None,
         bridge: bool | None = None,
     ) -> Tensor:
         """Un-noised embeddings (B, D) that condition the network; for arguments and errors see `__call__`."""
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
-        touches = self._prepare_touch(touch, sensor)
+        touches = self._prepare_touch(touch, sensor, background)
         return self._encode(touches, strength, bridge, RunReport())[1]
 
     def _encode(

@@ -80,7 +80,7 @@ class TouchToTextPipeline(UniTouchPipeline):
     def __call__(
         self,
         touch: ImageInput = None, question: str | list[str] | None = None, max_new_tokens: int | None = None,
-        sensor: SensorNames = None, bridge: bool | None = None,
+        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
         weights: Sequence[float] | None = None, image: ImageInput = None, touch_embeds: Tensor | None = None,
         generator: torch.Generator | None = None, return_dict: bool = True, **generate: Any,
     ) -> TouchToTextPipelineOutput | tuple:  # fmt: skip
@@ -107,9 +107,9 @@ class TouchToTextPipeline(UniTouchPipeline):
         if others or not name:
             raise InvalidInputError("`touch`, `image` or `touch_embeds` has to be passed, one of them.")
         if name == "touch":
-            bridge, inputs = self._check_bridge(bridge), self._prepare_touch(touch, sensor)
+            bridge, inputs = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
         else:
-            check_unused(name, sensor=sensor, bridge=bridge or None)
+            check_unused(name, sensor=sensor, background=background, bridge=bridge or None)
             inputs = touch_embeds if name == "touch_embeds" else self._joint(name) and self.processor.images(image)
         if name == "touch_embeds":
             check_tensor(name, inputs, "B", self.embedding_dim)
@@ -147,9 +147,11 @@ class TouchToTextPipeline(UniTouchPipeline):
         return TouchToTextPipelineOutput(texts, report, embeds, encoded) if return_dict else (texts, report)
 
     @runs_networks
-    def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, bridge: bool | None = None) -> Tensor:
+    def encode_touch(
+        self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None
+    ) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        bridge, touches = self._check_bridge(bridge), self._prepare_touch(touch, sensor)
+        bridge, touches = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
         return self._encode("touch", touches, None, bridge, AnswerReport())[1]
 
     def _encode(

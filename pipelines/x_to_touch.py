@@ -287,7 +287,7 @@ class XToTouchPipeline(UniTouchPipeline):
         if "audio" in given:
             inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], audible=True)}
         if "touch" in given:
-            inputs["touch"] = self._prepare_touch(given["touch"], source_sensor)
+            inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
         sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]
         for name, size in zip(inputs, sizes, strict=True):
             if size not in (1, max(sizes)):

@@ -59,7 +59,7 @@ BAD = {
         ("touch-to-image empty -o out", "'empty', where there are no images"),
         ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
         ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cannot be read as an image"),
-        (f"{TO_TOUCH} --text brick --background gone.png", "--background", "gone.png"),
+        (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
         (f"{TO_IMAGE} --load-sensor in/dark.png", "`file` is", "cannot be read"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
         (f"{TO_TOUCH} --audio silence.wav", "`audio` is silent"),

@@ -71,6 +71,7 @@ def test_what_is_known_is_said_in_words():
     shares, unlike = {"brick": 0.8, "tile": 0.12}, "unlike anything known"
     assert str(Named(shares, None)) == "brick 80%, tile 12%"
     assert str(Named(shares, unlike)) == f"{unlike} (nearest: brick)"
+    assert str(Named(shares, "nothing is touched")) == "nothing is touched"
 
 
 def test_only_the_best_are_named(classifier, images):

@@ -83,6 +83,13 @@ def test_the_nearest_prototype_is_taken_when_no_sensor_is_given(model: UniTouchM
     assert model.sensor_ids(matches).tolist() == [2, 0, 1]
 
 
+def test_re_centred_touches_are_those_of_the_sensor_that_they_are_matched_with(model: UniTouchModel) -> None:
+    bump, rest = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.6)
+    bump[..., 8:16, 8:16] = 0.1
+    found = model.recentre(normalise_pixels(rest + bump), normalise_pixels(rest), model.match_sensors(rest, "gelsight"))
+    torch.testing.assert_close(found, normalise_pixels(0.2 + bump))
+
+
 # Encoders on demand ---------------------------------------------------------------------------------------------------
 
 

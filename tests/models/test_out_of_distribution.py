@@ -1,4 +1,4 @@
-"""Touches that the encoder does not know, on the built-in weights, and what is said of them."""
+"""Touches that the encoder does not know, on the built-in weights; untouched gels; and what is said of them."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ import torch
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.out_of_distribution import UNLIKE, touch_statistics, warn_of_unknown
+from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, touch_statistics, warn_of_unknown
+from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World, draw_sensor
 
 
@@ -34,6 +35,14 @@ def test_a_model_without_a_distance_says_nothing(model: UniTouchModel, inputs: d
     assert model.unknown_touches(**inputs["touch"]) == []
 
 
+def test_a_touch_is_compared_with_its_gel_at_rest() -> None:
+    rest = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    noise = rest + 0.01 * torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    pressed = rest.clone()
+    pressed[..., 20:30, 20:30] += 0.05
+    assert is_untouched(torch.cat([rest, noise, pressed]), rest).tolist() == [True, True, False]
+
+
 def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     noise = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     mixed = torch.stack([noise[:, 0], 0.5 * noise[:, 0] + 0.5 * noise[:, 1], noise[:, 2]], dim=1)
@@ -51,7 +60,7 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
 def test_unknown_touches_are_told_by_their_places_in_one_line() -> None:
     with pytest.warns(UnfamiliarInputWarning, match="^`touch`: unlike anything known. What"):
         warn_of_unknown([UNLIKE])
-    many = "^`touch.1.`: unlike anything known; `touch.2.`: unlike anything known; .* and 3 more. What"
+    many = "^`touch.1.`: nothing is touched; `touch.2.`: unlike anything known; .* and 3 more. What"
     with pytest.warns(UnfamiliarInputWarning, match=many):
-        warn_of_unknown([None, *6 * [UNLIKE]])
+        warn_of_unknown([None, UNTOUCHED, *5 * [UNLIKE]])
     warn_of_unknown([None, None])

@@ -75,11 +75,12 @@ def test_a_bank_of_none_matches_none() -> None:
         bank.match(torch.rand(2, 3, 8, 8), "digit")
 
 
-def test_an_image_out_of_reach_of_all_is_of_none() -> None:
+def test_an_image_out_of_reach_of_all_is_of_none_unless_the_nearest_is_asked_for() -> None:
     bank = reaching(dark=0.05, bright=0.05)
     assert [match.name for match in bank.match(levels(0.24, 0.26, 0.76))] == ["dark", None, "bright"]
     assert bank.match(levels(0.26))[0].distance == pytest.approx(0.06)
     assert bank.match(levels(0.45), "bright")[0].name == "bright"
+    assert bank.match(levels(0.45), nearest=True)[0].name == "dark"
 
 
 def test_reaches_are_of_areas_and_the_sensor_whose_own_touches_lie_as_far_is_retrieved() -> None:

@@ -45,7 +45,7 @@ TO_IMAGE = {
     "negative_prompt_embeds": ([torch.zeros(3, 12, 16)], []),
     "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None]]),
     "sensor": (["gelsigt", "", ["gelsight"] * 3, [], [3, None]], []),
-    "bridge": ([True], ["london", 1]),
+    "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]), "bridge": ([True], ["london", 1]),
 }  # fmt: skip
 STYLIZE = {
     "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
@@ -75,7 +75,7 @@ PAIRS = {
         {"touch": torch.zeros(3, 32, 32), "touch_embeds": torch.ones(2, 16)}, {"touch": None},
         {"prompt": "a", "prompt_embeds": torch.zeros(1, 12, 16)},
         *({name: value, "touch": None, "touch_embeds": torch.ones(1, 16)} for name, value in
-          {"sensor": "digit", "strength": 0.5, "bridge": True}.items()),
+          {"sensor": "digit", "strength": 0.5, "background": torch.zeros(3, 32, 32), "bridge": True}.items()),
     ],
     "stylize": [{"touch_weight": 0, "image_weight": 0}],
     "x_to_touch": [
@@ -143,6 +143,7 @@ def test_what_needs_a_part_that_is_missing(components, x_components, touch):
         (alone, "text", {"text": "brick"}),
         (TouchToImagePipeline(**components), "sensor", {"touch": touch}),
         (sensorless, "sensor", {"touch": touch, "sensor": "digit"}),
+        (sensorless, "background", {"touch": touch, "background": touch}),
     ):
         with pytest.raises(InvalidInputError, match=f"`{name}`"):
             pipe(**options)

@@ -57,6 +57,14 @@ def test_sensors_are_those_named_or_retrieved_by_their_prototypes(pipe, touch, s
     assert not torch.allclose(pipe.encode_touch(touch, sensor=other), named, atol=1e-4)
 
 
+def test_a_background_takes_the_look_of_its_sensor_away(pipe, touch):
+    like_digit = torch.full((3, 32, 32), 0.8)
+    found = pipe.encode_touch(touch, sensor="digit", background=like_digit)
+    assert_close(found, pipe.encode_touch(touch, sensor="digit"), atol=1e-5, rtol=0)
+    found = pipe.encode_touch(touch[:1] + 0.1, background=torch.full((3, 32, 32), 0.3))
+    assert_close(found, pipe.encode_touch(touch[:1]), atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize(("fixture", "encode"), [("pipe", "encode_touch"), ("x_to_touch", "encode_condition")])
 def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode, monkeypatch):
     pipe, reasons = request.getfixturevalue(fixture), ["unlike anything known", None]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def touch_to_image(
     context: Context, touch: options.Touches, output: options.Output,
     prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None,
+    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
@@ -54,7 +54,7 @@ def stylize(
     layout: Annotated[int, Option(min=2, help="Cells along a side of the grid on which the photo is held.")] = 12,
     keep_colours: Annotated[bool, Option("--keep-colours", metavar="", help="Hold its mean colour, too.")] = False,
     prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None,
+    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,

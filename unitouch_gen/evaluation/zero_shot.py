@@ -13,6 +13,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, check_kind, check_texts
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.out_of_distribution import UNTOUCHED
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.world import MATERIAL_NAMES
 
@@ -41,7 +42,7 @@ class Named(dict[str, float]):
     def __str__(self) -> str:
         if self.unknown is None:
             return ", ".join(f"{name} {share:.0%}" for name, share in self.items())
-        return f"{self.unknown} (nearest: {next(iter(self))})"
+        return self.unknown if self.unknown == UNTOUCHED else f"{self.unknown} (nearest: {next(iter(self))})"
 
 
 class ZeroShotTouchClassifier:

@@ -17,7 +17,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
 from unitouch_gen.files import as_path, check_file, local_folder, read_settings, reading, saved_whole
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.images import denormalise_pixels
+from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import AddedSensor, SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
@@ -127,19 +127,30 @@ class UniTouchModel(PreTrainedModel):
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
 
-    def match_sensors(self, pixel_values: Tensor, sensor: Sensors = None) -> list[SensorMatch]:
+    def match_sensors(self, pixel_values: Tensor, sensor: Sensors = None, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each touch (B, 3, S, S), named or retrieved; see `SensorBank.match`."""
         _, sensor_bank = self.load("touch")
         raw, size = denormalise_pixels(pixel_values.float()), self.config.prototype_size
         if len(sensor_bank) and raw.shape[-1] != size:
             raw = F.interpolate(raw, (size, size), mode="bilinear", antialias=True)
-        return sensor_bank.match(raw, sensor)
+        return sensor_bank.match(raw, sensor, nearest=nearest)
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor:
         """Bank indices (B,) of matches, -1 for a match without a name."""
         _, sensor_bank = self.load("touch")
         indices = [-1 if match.name is None else sensor_bank.index(match.name) for match in matches]
         return torch.tensor(indices, device=self.device)
+
+    def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
+        """Touches (B, 3, S, S) recoloured to the matched sensor: t - background + prototype.
+
+        The background (1 or B, 3, S, S) is the touches' own sensor untouched, or its mean image.
+        """
+        _, sensor_bank = self.load("touch")
+        raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
+        prototypes = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
+        prototypes = F.interpolate(prototypes.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
+        return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
 
     @torch.no_grad()
     @apply_forward_hook

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import UnfamiliarInputWarning
 
-UNLIKE = "unlike anything known"
+UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming a touch."""
 
 

@@ -91,11 +91,12 @@ class SensorBank(nn.Module):
         """Mean raw image of a sensor, in [0, 1], (3, S, S); zeros until it is set."""
         return self.prototypes[self.index(name)].view(3, self.prototype_size, self.prototype_size)
 
-    def match(self, raw_pixels: Tensor, sensor: Sensors = None) -> list[SensorMatch]:
+    def match(self, raw_pixels: Tensor, sensor: Sensors = None, *, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each image (B, 3, S, S) in [0, 1]: the one named, or the one that is retrieved.
 
         That is the nearest prototype by L1 distance, as in the paper. Where the bank has `reaches`, it is the one with
-        the least `layout_distances` over its reach, and none where the image is out of reach of all.
+        the least `layout_distances` over its reach, and none where the image is out of reach of all, unless the
+        `nearest` is asked for.
         """
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
@@ -114,7 +115,7 @@ class SensorBank(nn.Module):
         matches = []
         for index, row, by in zip(indices, distances, retrieved, strict=True):
             chosen = int(by.argmin()) if index is None else index
-            out_of_reach = index is None and self.reaches and by[chosen] > 1.0
+            out_of_reach = index is None and self.reaches and not nearest and by[chosen] > 1.0
             distance = row[chosen].item() if self.known[chosen] else None
             matches.append(SensorMatch(None if out_of_reach else self.names[chosen], distance))
         return matches

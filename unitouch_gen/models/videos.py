@@ -31,6 +31,11 @@ def change_of(touch: Tensor, background: Tensor) -> Tensor:
     return F.avg_pool2d((small[0] - small[1]).abs().mean(dim=1), 4)
 
 
+def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
+    """Whether touches hardly differ from their gel at rest, bool (B,)."""
+    return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
+
+
 @dataclass(frozen=True)
 class Contact:
     """The firmest frame of a contact and the gel at rest, RGB, uint8 (H, W, 3); the index of that frame; and its mean
@@ -47,7 +52,7 @@ def contacts(
 ) -> Iterator[Contact]:
     """Contacts of a stream of frames, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
 
-    Each goes into a pipeline: `pipe(contact.frame)`.
+    Each goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
 
     Args:
         frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images. It begins before
