@@ -7,7 +7,6 @@ conditioning, goes from noise to latents (`_denoise`), and from latents to pictu
 import copy
 import math
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -47,7 +46,7 @@ from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
-from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
+from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
 
 Generators = torch.Generator | list[torch.Generator] | None
@@ -452,7 +451,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Writes the given card, the pipeline's own, or a default one, whose example loads `name`."""
         known = card or self._card or Card()
         if isinstance(known, Path):
-            shutil.copyfile(known / CARD, folder / CARD)
+            copy_card(known, folder)
         else:
             known.write(folder, name, self)
 

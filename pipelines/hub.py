@@ -6,6 +6,7 @@ Python files of the folder. Those written here import them from this package, so
 """
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 from huggingface_hub import ModelCard, ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
 __all__ = [
@@ -28,7 +30,7 @@ CODE = '''"""The classes of this folder are in the package `unitouch_gen`, which
 from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
-CARD = "README.md"
+CARD, PICTURES = "README.md", "pictures"
 
 
 def name_classes(folder: Path) -> None:
@@ -62,6 +64,9 @@ def located(index: Mapping[str, Any]) -> dict[str, Any]:
 class Card:
     """A model card: the README.md saved with a model.
 
+    Raises:
+        InvalidInputError: If a picture is not there.
+
     Example:
         >>> card = Card(figures={"material named right": "73.8 %"}, license="apache-2.0")
         >>> card.license
@@ -73,9 +78,21 @@ class Card:
     data: str = ""  #: training data
     license: str = ""  #: its short name, such as "apache-2.0"
     limits: str = "It draws something for every input, also for one that is like nothing it was trained on."
+    pictures: Mapping[str, str | Path] = field(default_factory=dict)  #: image files by caption
+
+    def __post_init__(self) -> None:
+        for caption, file in self.pictures.items():
+            if not Path(file).is_file():
+                raise InvalidInputError(f"`pictures` has {str(file)!r} for {caption!r}, which is no file.")
 
     def write(self, folder: Path, name: str, pipe: Any) -> None:
-        """Writes README.md; its example loads the pipeline by `name`, a folder or repository id."""
+        """Writes README.md and its pictures; its example loads the pipeline by `name`, a folder or repository id."""
+        images = ""
+        for number, (caption, file) in enumerate(self.pictures.items()):
+            place = f"{PICTURES}/{number}-{Path(file).name}"
+            (folder / PICTURES).mkdir(exist_ok=True)
+            shutil.copyfile(file, folder / place)
+            images += f"![{caption}]({place})\n\n*{caption}*\n\n"
         figures = "\n".join(f"| {key} | {value} |" for key, value in self.figures.items())
         content = TEMPLATE.format(
             data=ModelCardData(
@@ -86,6 +103,7 @@ class Card:
             ).to_yaml(),
             title=Path(name).name,
             description=self.description or str(type(pipe).__doc__).splitlines()[0],
+            images=images,
             kind=type(pipe).__name__,
             name=name,
             call=pipe._example_call,
@@ -106,7 +124,7 @@ TEMPLATE = """---
 
 {description}
 
-## How to use it
+{images}## How to use it
 
 ```python
 from unitouch_gen import {kind}, example  # pip install unitouch_gen
@@ -136,3 +154,10 @@ is `pipeline.py`, which imports `unitouch_gen`.
 
 {license}
 """
+
+
+def copy_card(source: Path, folder: Path) -> None:
+    """Copies the model card of another folder, with its pictures."""
+    shutil.copyfile(source / CARD, folder / CARD)
+    if (source / PICTURES).is_dir():
+        shutil.copytree(source / PICTURES, folder / PICTURES, dirs_exist_ok=True)

@@ -1,5 +1,6 @@
 """Pipelines of the built-in tiny family; components they share are stored once."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,6 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
 }
-
-
-CARD = Card(
-    data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
-    "recording of a real sensor.",
-    license="apache-2.0",
-    limits="It is small and knows a procedural world; of real touches it says little.",
-)
 
 
 def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
@@ -83,8 +76,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
                 "text_encoder": joint.text_model.text_model.eval(),
             }
         pipe = kind(**parts)
-    if family.resolve() == weights.FAMILY.resolve():
-        pipe._card = CARD
+    pipe._card = _card(family, name)
     return pipe
 
 
@@ -104,3 +96,34 @@ def _family(family: str | Path) -> Path:
             "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
         )
     return family
+
+
+SHOWN = {  # caption of a model card's picture; what its figures measure
+    "touch-to-image": ("Unseen touches, and below each the picture generated from it, of invented colours.", "picture"),
+    "stylization": ("Photos, touches of other materials, and the photos restyled by them.", "photo"),
+    "x-to-touch": ("Photos of unseen objects, and below each the touch generated from it.", "touch"),
+}
+
+
+def _card(family: Path, name: str) -> Card:
+    """The model card of a family's pipeline: measured figures and, if built in, its training data."""
+    caption, made = SHOWN[name]
+    file = family / weights.FIGURES.name
+    held = read_settings("family", file) if file.is_file() else {}
+    rows = held.get("figures", {}).get("quality", {}).get("rows", {})
+    figures = {
+        key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
+        f"{row['ceiling']:.1%})"
+        for key, row in rows.items()
+        if re.fullmatch(rf"\w+ to {made}: (material|contact within material|grain within 20)", key)
+    }
+    if family.resolve() != weights.FAMILY.resolve():
+        return Card(figures=figures)
+    return Card(
+        figures=figures,
+        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
+        "recording of a real sensor.",
+        license="apache-2.0",
+        limits="It is small and knows a procedural world; of real touches it says little.",
+        pictures={caption: weights.CARDS / f"{name}.jpg"},
+    )

@@ -100,7 +100,7 @@ def test_an_address_that_is_none_is_refused():
 def test_data_files_are_installed():
     for name in (
         "py.typed", "examples/gelsight_brick.png", "examples/photos/wood.png", "examples/sounds/metal.wav",
-        "training/recipes/touch.yaml", "weights/family.json",
+        "training/recipes/touch.yaml", "weights/cards/stylization.jpg", "weights/family.json",
         "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
         "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
     ):  # fmt: skip

@@ -11,6 +11,8 @@ from PIL import Image
 
 from drawing import MARGIN, draw_grid, font, written
 from tests.helpers.processes import Child, finished, script
+from unitouch_gen import weights
+from unitouch_gen.pipelines.tiny import PIPELINES
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
@@ -79,6 +81,17 @@ def test_samples_run(file, tmp_path):
         pytest.skip(NOT_RUN[file.stem])
     finished(Child(script, file, "--output", "picture.png", folder=tmp_path))
     assert (tmp_path / "picture.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PIPELINES)
+def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
+    """Within less than another seed makes (1.8 and more): after new weights, they have to be drawn anew."""
+    words = ["--pipeline", name, "--output", "drawn.jpg"]
+    finished(Child(script, SAMPLES / "card_pictures.py", *words, folder=tmp_path))
+    pictures = [Image.open(file) for file in (tmp_path / "drawn.jpg", weights.CARDS / f"{name}.jpg")]
+    drawn, shown = (np.asarray(picture, dtype=float) for picture in pictures)
+    assert np.abs(drawn - shown).mean() < 1
 
 
 @pytest.mark.wheel

@@ -58,7 +58,8 @@ def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_pat
     call.pipe.save_pretrained(tmp_path)
     loaded = Call(quiet(type(call.pipe).from_pretrained(tmp_path)), call.inputs)
     assert_close(loaded.latents(num_inference_steps=2), call.latents(num_inference_steps=2), atol=1e-4, rtol=1e-4)
-    assert "license: apache-2.0" in (tmp_path / "README.md").read_text()
+    card = (tmp_path / "README.md").read_text()
+    assert "license: apache-2.0" in card and "class mean" in card and list((tmp_path / "pictures").iterdir())
 
 
 def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):

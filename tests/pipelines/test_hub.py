@@ -48,9 +48,10 @@ def test_our_loader_reads_a_repository(family, touch, monkeypatch):
 
 
 def test_a_card_is_one_that_huggingface_reads_and_goes_where_its_pipeline_goes(pipe, tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "shown.png")
     card = Card(
         description="Touches of bricks.", figures={"bricks named right": 0.5}, data="Bricks.", license="apache-2.0",
-        limits="No tiles.",
+        limits="No tiles.", pictures={"A brick": tmp_path / "shown.png"},
     )  # fmt: skip
     pipe.save_pretrained(tmp_path / "one", card=card)
     TouchToImagePipeline.from_pretrained(tmp_path / "one").save_pretrained(tmp_path / "two")
@@ -59,6 +60,7 @@ def test_a_card_is_one_that_huggingface_reads_and_goes_where_its_pipeline_goes(p
         assert (read.data.license, read.data.library_name) == ("apache-2.0", "diffusers")
         for said in ("Touches of bricks.", "| bricks named right | 0.5 |", "Bricks.", "No tiles."):
             assert said in read.text
+        assert Image.open(folder / re.search(r"!\[A brick\]\((.*)\)", read.text)[1]).size == (8, 8)
     pipe.save_pretrained(tmp_path / "two", card=Card(description="ours"))  # which one that is there gives way to
     assert "ours" in (tmp_path / "two" / "README.md").read_text()
     with pytest.raises(InvalidTypeError, match="`card`"):

@@ -1,0 +1,49 @@
+"""Draws what the model card of a built-in pipeline shows: inputs above, and what is generated from them below.
+
+python samples/card_pictures.py --pipeline stylization
+for name in touch-to-image stylization x-to-touch; do    # the cards' own
+    python samples/card_pictures.py --pipeline $name --output unitouch_gen/weights/cards/$name.jpg
+done
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+import unitouch_gen
+from drawing import draw_grid, save
+from unitouch_gen.examples import example, examples
+from unitouch_gen.pipelines.tiny import PIPELINES
+
+LABELS = {"image": "photo", "touch": "touch"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--output", type=Path, default=Path("outputs/card.jpg"))
+    parser.add_argument("--pipeline", choices=PIPELINES, default="touch-to-image")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+
+    names = {"image": list(examples("image")), "touch": list(examples())}
+    if arguments.pipeline == "stylization":
+        names["touch"] = ["wood", "tile", "brick", "gravel"]  # one for each photo
+    else:
+        del names["touch" if arguments.pipeline.startswith("x-to-touch") else "image"]
+    inputs = {modality: [example(name, modality) for name in of] for modality, of in names.items()}
+    titles = [" + ".join(column).replace("_", " ") for column in zip(*names.values(), strict=True)]
+    generators = [torch.Generator().manual_seed(arguments.seed + number) for number in range(len(titles))]
+    generated = unitouch_gen.tiny(arguments.pipeline)(**inputs, generator=generators).images
+    grid = draw_grid(
+        [*([Image.open(file) for file in files] for files in inputs.values()), generated],
+        labels=[*(LABELS[modality] for modality in inputs), "generated"],
+        titles=titles,
+        size=16,
+    )
+    save(grid, arguments.output)
+
+
+if __name__ == "__main__":
+    main()
