@@ -421,25 +421,22 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
-        Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
-        finds our classes, and a model card, README.md. Without `card`, an existing card stays; else that which the
-        pipeline was loaded with is written.
+        LoRA weights are left out, but for fused ones. Also writes two-line Python files, by which
+        `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)` finds our classes, and a model card,
+        README.md. Without `card`, an existing card stays; else that which the pipeline was loaded with is written.
 
         Raises:
-            InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
+            InvalidInputError: If the folder cannot be written to; what it held stays as it was.
         """
         if card is not None:
             check_kind("card", card, Card)
         folder = as_path("save_directory", save_directory)
         upload = kwargs.pop("push_to_hub", False)
-        networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
-        if any(hasattr(layer, "base_layer") for network in networks for layer in network.modules()):
-            raise InvalidInputError(
-                "This pipeline cannot be saved with LoRA weights beside its own; `unload_lora_weights()` first, and "
-                "`fuse_lora()` before that to keep what they do."
-            )
+        plain = copy.copy(self)
+        for name, part in without_lora(self.components).items():
+            setattr(plain, name, part)
         with writing_folder("save_directory", folder) as place:
-            super().save_pretrained(place, *args, **kwargs)
+            super(UniTouchPipeline, plain).save_pretrained(place, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
                 name_classes(place)
             if card is not None or not (folder / CARD).exists():
@@ -482,6 +479,20 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def unload_sensor(self, name: str) -> None:
         """Removes a sensor that `load_sensor` added."""
         self._joint("unload_sensor").unload_sensor(name)
+
+
+def without_lora(components: dict[str, Any]) -> dict[str, Any]:
+    """Networks that have LoRA layers without these: copies that share all weights, fused ones too."""
+    networks = {name: part for name, part in components.items() if isinstance(part, torch.nn.Module)}
+    shared = {id(one): one for part in networks.values() for one in [*part.parameters(), *part.buffers()]}
+    wrapped = {name for name, part in networks.items() if any(hasattr(one, "base_layer") for one in part.modules())}
+    plain = {name: copy.deepcopy(networks[name], shared) for name in wrapped}
+    for network in plain.values():
+        network._hf_peft_config_loaded = False  # type: ignore[assignment]  # or transformers writes LoRA weights alone
+        for module in list(network.modules()):
+            for key, child in module.named_children():
+                setattr(module, key, getattr(child, "base_layer", child))
+    return plain
 
 
 def check_filled(folder: Path, network: Any) -> None:

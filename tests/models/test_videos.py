@@ -2,10 +2,12 @@
 
 import struct
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.helpers import recordings
 from tests.helpers.recordings import FIRMEST
@@ -97,10 +99,20 @@ def test_pixels_of_a_video_are_made_square(tmp_path):
     )
 
 
-def test_a_video_is_one_by_any_name(tmp_path):
+@pytest.mark.parametrize("kind", ["gif", "png", "webp", "tiff", "mp4"])
+def test_images_that_move_are_videos_by_any_name(tmp_path, kind):
+    """Equal frames are stored as a longer one; they count by their time."""
     images = list(recordings.frames(noise=0.0))
-    file = recordings.write(tmp_path / "press.mp4", images).rename(tmp_path / "press")
-    found, expected = (UniTouchProcessor(image_size=32).touch(one) for one in (file, images[FIRMEST]))
+    if kind == "mp4":
+        recordings.write(tmp_path / "press.mp4", images)
+    else:
+        first, *others = map(Image.fromarray, images)
+        options = {} if kind == "tiff" else {"duration": 40, "lossless": True}
+        first.save(tmp_path / f"press.{kind}", save_all=True, append_images=others, **options)
+    file = (tmp_path / f"press.{kind}").rename(tmp_path / "press")
+    with nullcontext() if kind == "mp4" else pytest.warns(UserWarning, match=r"contact is used, frame (19|20|21)"):
+        found = UniTouchProcessor(image_size=32).touch(file)
+    expected = UniTouchProcessor(image_size=32).touch(images[FIRMEST])
     assert (found - expected).abs().mean() < 0.1
 
 

@@ -113,24 +113,26 @@ def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(t
             load(there)
 
 
-def test_lora_weights_are_fused_or_unloaded_before_saving(pipe, touch, tmp_path):
-    """Files of a network with such layers in it, as diffusers writes them, are refused."""
+@pytest.mark.parametrize("fused", [False, True])
+def test_weights_are_saved_under_their_own_names_whatever_is_loaded_beside_them(pipe, touch, tmp_path, fused):
+    """Base weights with LoRA loaded, fused ones after fusing; over its own folder, too. diffusers' own is refused."""
     config = pytest.importorskip("peft").LoraConfig(target_modules=["to_q", "q_proj"], init_lora_weights=False)
     call = Call(pipe, {"touch": touch})
+    before = call.latents()
+    pipe.register_modules(text_encoder=pipe.unitouch.load("text")[0].text_model)  # as in the built-in family
     base = call.latents()
-    pipe.unet.add_adapter(config, "made"), pipe.text_encoder.add_adapter(config, "made")
-    with pytest.raises(InvalidInputError, match="unload_lora_weights"):
-        pipe.save_pretrained(tmp_path / "own")
-    assert not (tmp_path / "own").exists()
-    pipe.fuse_lora()
-    drawn = call.latents()
-    pipe.unet.save_pretrained(tmp_path / "unet")
-    pipe.unload_lora_weights()
     pipe.save_pretrained(tmp_path / "own")
-    assert not torch.allclose(base, drawn, atol=1e-3)
-    assert_close(Call(load(tmp_path / "own"), call.inputs).latents(), drawn, atol=1e-4, rtol=1e-4)
-    shutil.rmtree(tmp_path / "own" / "unet")
-    (tmp_path / "unet").rename(tmp_path / "own" / "unet")
+    pipe.unet.add_adapter(config, "made"), pipe.text_encoder.add_adapter(config, "made")
+    if fused:
+        pipe.fuse_lora()
+    drawn = call.latents()
+    assert not torch.allclose(base, drawn, atol=1e-3) and not torch.allclose(base, before, atol=1e-3)
+    pipe.save_pretrained(tmp_path / "own")
+    assert torch.equal(call.latents(), drawn)
+    found = Call(load(tmp_path / "own"), call.inputs)
+    assert_close(found.latents(), drawn if fused else base, atol=1e-4, rtol=1e-4)
+    assert all(found.pipe.unitouch.load(modality) for modality in ("text", "touch"))
+    pipe.unet.save_pretrained(tmp_path / "own" / "unet")
     with pytest.raises(InvalidInputError, match=r"unet. holds \d+ of the \d+ numbers"):
         load(tmp_path / "own")
 

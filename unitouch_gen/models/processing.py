@@ -81,7 +81,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
-        A video or an iterator of frames is the firmest of its `contacts`.
+        A video, an animated image or an iterator of frames is the firmest of its `contacts`.
         """
         if isinstance(touch, list | tuple):
             return self.images([firmest(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)

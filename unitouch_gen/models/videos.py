@@ -2,8 +2,10 @@
 
 import os
 import re
+import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image, ImageSequence
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe, first_line, needed
@@ -126,18 +129,33 @@ def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: 
 
 
 def firmest(name: str, source: Any) -> Any:
-    """The firmest contact of a video or an iterator of frames; any other input as it is."""
-    if not (isinstance(source, Iterator) or is_video(source)):
+    """The firmest contact of a video, an animated image or an iterator of frames; any other input as it is."""
+    frames = source if isinstance(source, Iterator) else moving(source)
+    if frames is None:
         return source
-    return max(contacts(source, name=name), key=lambda contact: contact.firmness).frame
+    best = max(contacts(frames, name=name), key=lambda contact: contact.firmness)
+    if isinstance(frames, list):
+        warnings.warn(f"`{name}` is an animation; its firmest contact is used, frame {best.index}.", stacklevel=2)
+    return best.frame
 
 
-def is_video(source: Any) -> bool:
-    """Whether it is the path of a video, by its name or how it begins."""
-    if not isinstance(source, str | os.PathLike) or not os.path.isfile(source):
-        return False
-    with open(source, "rb") as file:
-        return Path(source).suffix.lower() in VIDEOS or re.match(CONTENTS, file.read(16), re.DOTALL) is not None
+def moving(source: Any) -> Any:
+    """The path of a video, or frames of an animated image (GIF, APNG, TIFF) if enough for a contact; or `None`."""
+    is_file = isinstance(source, str | os.PathLike) and os.path.isfile(source)
+    with open(source, "rb") if is_file else nullcontext(source) as opened:
+        if is_file and (Path(source).suffix.lower() in VIDEOS or re.match(CONTENTS, opened.read(16), re.DOTALL)):
+            return source
+        try:
+            image = Image.open(opened) if is_file else opened
+            if getattr(image, "n_frames", 1) < 2 or image.tell() > 0:  # a frame that the user has chosen
+                return None
+            stored = [(frame.copy(), frame.info.get("duration", 0)) for frame in ImageSequence.Iterator(image)]  # type: ignore[arg-type]
+            image.seek(0)
+        except Exception:  # of as many kinds as there are formats; `load_images` tells them
+            return None
+    unit = min((duration for _, duration in stored if duration), default=1)  # equal frames are stored as a longer one
+    frames = [frame for frame, duration in stored for _ in range(min(max(round(duration / unit), 1), 100))]
+    return frames if len(frames) >= QUIET + 3 and len({frame.size for frame in frames}) == 1 else None
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
