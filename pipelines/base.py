@@ -158,16 +158,15 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return self.config[f"default_{name}"] if value is None else value
 
     def _check_steps(
-        self, num_inference_steps: Any, timesteps: Any, sigmas: Any, solver: Any, tolerance: Any, max_evaluations: Any,
-        eta: Any, init_strength: float = 1.0,
+        self, num_inference_steps: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any,
+        init_strength: float = 1.0,
     ) -> Steps:  # fmt: skip
         """Validated steps, by default the checkpoint's number; see `prepare_steps`."""
-        if timesteps is None and sigmas is None and tolerance is None:
+        if tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         return prepare_steps(
-            self.scheduler, num_inference_steps=num_inference_steps, timesteps=timesteps, sigmas=sigmas, solver=solver,
-            tolerance=tolerance, max_evaluations=max_evaluations, eta=eta, init_strength=init_strength,
-            device=self._execution_device,
+            self.scheduler, num_inference_steps=num_inference_steps, solver=solver, tolerance=tolerance,
+            max_evaluations=max_evaluations, eta=eta, init_strength=init_strength, device=self._execution_device,
         )  # fmt: skip
 
     def _check_guidance(self, scale: float | None) -> Guidance:
@@ -363,25 +362,21 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     num_timesteps = property(lambda self: self._num_timesteps)
     interrupt = property(lambda self: self._interrupt)
 
-    def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
-        """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that are finite."""
-        rows = [row for row, code in enumerate(report.codes) if code.finite]
-        if not rows:
-            return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
-        pixels = decode(self.vae, latents[rows])
-        finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
-        for row in torch.tensor(rows)[~finite.cpu()].tolist():
-            if throw:
-                raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
-            report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
-        return pixels[finite]
-
     def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
         """Latents (B, C, h, w) -> pictures of the output type, of the samples that are finite."""
+        rows = [row for row, code in enumerate(report.codes) if code.finite]
         if settings.output_type == "latent":
             report.left_out.append("VAE decoder")
-            return latents[[code.finite for code in report.codes]]
-        pixels = self._decode(latents, report, settings.throw)
+            return latents[rows]
+        pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        if rows:
+            pixels = decode(self.vae, latents[rows])
+            finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
+            for row in torch.tensor(rows)[~finite.cpu()].tolist():
+                if settings.throw:
+                    raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
+                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+            pixels = pixels[finite]
         return self.image_processor.postprocess(pixels, output_type=settings.output_type)
 
     # Reading and saving -----------------------------------------------------------------------------------------------

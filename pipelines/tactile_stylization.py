@@ -1,7 +1,6 @@
 """`TactileStylizationPipeline`: a photo restyled by a touch (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.conditioning import apply_strength, mix_linear, mix_to_norm
+from unitouch_gen.conditioning import mix_linear, mix_to_norm
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
@@ -70,17 +69,6 @@ class LayoutHold:
         return held
 
 
-@dataclass(frozen=True)
-class Mixture:
-    """Photos, touches and their weights for B pictures."""
-
-    photos: Tensor  # pixel values (1 or B, 3, S, S)
-    touches: Touches  # 1 or B; with several touch weights, all are mixed into every picture
-    touch_weights: list[float]  # sum to 1 with `image_weight`
-    image_weight: float
-    batch_size: int  # B
-
-
 class TactileStylizationPipeline(TouchToImagePipeline):
     """Restyles photos by touches: the same unCLIP model, on a mix of both embeddings, holding the photo's layout.
 
@@ -93,10 +81,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     def __call__(  # type: ignore[override]
         self,
         image: ImageInput = None, touch: ImageInput = None, prompt: str | list[str] | None = None,
-        touch_weight: float | Sequence[float] | None = None, image_weight: float | None = None, mix: str = "linear",
+        touch_weight: float | None = None, image_weight: float | None = None, mix: str = "linear",
         layout: int | None = 12, keep_colours: bool = False, init_strength: float = 1.0,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         strength: float = 1.0, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
@@ -118,8 +105,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 all of the other.
             prompt: One prompt, or one for each picture; default "high quality".
             touch_weight, image_weight: Weights of the embeddings, normalised to a sum of 1. `touch_weight` defaults to
-                0.7, and without a `layout` to the paper's 0.3; `image_weight` to the rest. A list of touch weights
-                mixes all touches into each picture.
+                0.7, and without a `layout` to the paper's 0.3; `image_weight` to the rest.
             mix: "linear", sum_i w_i e_i rescaled to the norm of image embeddings, as in X-to-touch; or "paper", the
                 plain sum, which is shorter the more its parts differ.
             layout: The photo's layout is held on a grid of so many cells along the picture's shorter side, from 2:
@@ -137,7 +123,6 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             >>> pipe = unitouch_gen.tiny("stylization")
             >>> pipe("photo.jpg", unitouch_gen.example("brick")).images[0].save("brick_photo.png")
             >>> pipe("photo.jpg", "brick.png", layout=None)  # as in the paper
-            >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.5, 0.2])  # two touches into one picture
         """
         # 1. Check inputs, before any network runs
         strength = check_number("strength", strength, 0.0, MAX_SCALE)
@@ -150,13 +135,20 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         if touch_weight is None:
             touch_weight = 0.3 if layout is None else 0.7
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
-        mixture = self._check_mixture(image, touch, image_weight, touch_weight, sensor, background)
-        batch_size = mixture.batch_size
+        weights = self._check_mixture(touch_weight, image_weight)
+        for name, value in (("image", image), ("touch", touch)):
+            if value is None:
+                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
+        touches, photos = self._prepare_touch(touch, sensor, background), self.processor.images(image)
+        sizes = (len(photos), len(touches.pixels))
+        if min(sizes) not in (1, max(sizes)):
+            raise InvalidInputError(f"`image` holds {sizes[0]} photos and `touch` {sizes[1]}; pass one, or one each.")
+        batch_size = max(sizes)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(
-                num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta, init_strength
+                num_inference_steps, solver, tolerance, max_evaluations, eta, init_strength
             ),
             guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
@@ -170,7 +162,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         # 2. Encode photos and touches, and mix their embeddings
         report = RunReport()
         with report.stage("mix"):
-            embeds = self._mixed(mixture, mix, strength, bridge, report, throw)
+            embeds = self._mixed(photos, touches, weights, batch_size, mix, strength, bridge, report, throw)
 
         # 3. Encode the photo's own latents
         photo: Any = None
@@ -186,54 +178,27 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 
     def _mixed(
-        self, mixture: Mixture, mix: str, strength: float, bridge: bool, report: RunReport, throw: bool
-    ) -> Tensor:
-        """Mixed embeddings (B, D); an encoder of zero weight does not run."""
-        parts, weights = list[Tensor](), list[float]()  # (1 or B, D) each
-        if sum(mixture.touch_weights) > 0:
-            touches = self._touch_embeds(mixture.touches, report, throw)
-            touches = self.embedding_bank.bridge(touches) if bridge else touches
-            parts += touches.split(1) if len(mixture.touch_weights) > 1 else [touches]
-            weights += mixture.touch_weights
+        self, photos: Tensor, touches: Touches, weights: list[float], batch_size: int, mix: str, strength: float,
+        bridge: bool, report: RunReport, throw: bool,
+    ) -> Tensor:  # fmt: skip
+        """Mixed embeddings (B, D) by the weights of touches and photos; an encoder of zero weight does not run."""
+        parts, shares = list[Tensor](), [weight for weight in weights if weight > 0]  # (1 or B, D) each
+        if weights[0] > 0:
+            embeds = self._touch_embeds(touches, report, throw)
+            parts.append(self.embedding_bank.bridge(embeds) if bridge else embeds)
         else:
             report.left_out.append("touch encoder")
-        if mixture.image_weight > 0:
-            parts.append(self._match_norm(self.unitouch.get_image_features(mixture.photos), "image", throw))
-            weights.append(mixture.image_weight)
+        if weights[1] > 0:
+            parts.append(self._match_norm(self.unitouch.get_image_features(photos), "image", throw))
         else:
             report.left_out.append("image encoder")
-        stacked = torch.stack([part.expand(mixture.batch_size, -1) for part in parts])
-        return apply_strength(MIXES[mix](stacked, torch.tensor(weights).to(stacked)), strength)
+        stacked = torch.stack([part.expand(batch_size, -1) for part in parts])
+        return strength * MIXES[mix](stacked, torch.tensor(shares).to(stacked))
 
-    def _check_mixture(
-        self,
-        image: ImageInput,
-        touch: ImageInput,
-        image_weight: float | None,
-        touch_weight: float | Sequence[float],
-        sensor: SensorNames,
-        background: ImageInput,
-    ) -> Mixture:
-        """Reads photos and touches, and checks their weights."""
-        for name, value in (("image", image), ("touch", touch)):
-            if value is None:
-                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
-        touches = self._prepare_touch(touch, sensor, background)
-        photos, count = self.processor.images(image), len(touches.pixels)
-        several = isinstance(touch_weight, list | tuple)
-        weights: Any = touch_weight if several else [touch_weight]
-        given = [check_number("touch_weight", weight, 0.0, MAX_SCALE) for weight in weights]
-        if several and len(given) != count:
-            raise InvalidInputError(f"`touch_weight` holds {len(given)} numbers for {count} touches; pass one each.")
-        remaining = 1.0 - sum(given)
-        if image_weight is None and remaining < 0:
-            raise InvalidInputError(f"`touch_weight` sums to {sum(given):g}; above 1, pass `image_weight`, too.")
-        image_weight = check_number("image_weight", remaining if image_weight is None else image_weight, 0.0, MAX_SCALE)
-        sizes = (len(photos), 1 if several else count)
-        if min(sizes) not in (1, max(sizes)):
-            raise InvalidInputError(
-                f"`image` holds {len(photos)} photos and `touch` {count} touches; pass one, or one each, or a list of "
-                "touch weights to mix all touches into each picture."
-            )
-        *touch_weights, image_weight = check_weights("touch_weight, image_weight", [*given, image_weight])
-        return Mixture(photos, touches, touch_weights, image_weight, max(sizes))
+    def _check_mixture(self, touch_weight: float, image_weight: float | None) -> list[float]:
+        """Weights of touches and photos, which sum to 1; that of photos defaults to the rest."""
+        touch_weight = check_number("touch_weight", touch_weight, 0.0, MAX_SCALE)
+        if image_weight is None and touch_weight > 1.0:
+            raise InvalidInputError(f"`touch_weight` is {touch_weight:g}; above 1, pass `image_weight`, too.")
+        image_weight = 1.0 - touch_weight if image_weight is None else image_weight
+        return check_weights("touch_weight, image_weight", [touch_weight, image_weight])

@@ -20,7 +20,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_strength, noise_embeddings
+from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
@@ -127,7 +127,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         self,
         touch: ImageInput = None, prompt: str | list[str] | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         strength: float | None = None, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
@@ -146,8 +145,6 @@ class TouchToImagePipeline(UniTouchPipeline):
             prompt: One prompt, or one for each touch; default "high quality".
             height, width: Picture size in pixels; multiples of the VAE's scale factor.
             num_inference_steps: Number of solver steps.
-            timesteps, sigmas: Custom steps in place of their number, for solvers that take them: falling timesteps from
-                0 to 999, or falling noise levels that end in 0.
             guidance_scale: s of classifier-free guidance, >= 0; active above 1.
             strength: Factor on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: Prompt of the unconditional branch; default empty.
@@ -209,7 +206,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
+            steps=self._check_steps(num_inference_steps, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
@@ -289,7 +286,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> tuple[Tensor, Tensor]:
         """Embeddings (B, D) of touches, first as encoded, then with bridge and strength."""
         encoded = self._touch_embeds(touches, report, throw)
-        return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
+        return encoded, strength * (self.embedding_bank.bridge(encoded) if bridge else encoded)
 
     def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.

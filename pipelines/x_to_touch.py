@@ -135,13 +135,12 @@ class XToTouchPipeline(UniTouchPipeline):
         *,
         weights: Mapping[str, float] | None = None,
         bridge: bool | None = None,
-        sampling_rate: int | None = None,
         source_sensor: SensorNames = None,
     ) -> Tensor:
         """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions, _ = self._prepare(given, weights, sampling_rate, source_sensor)
+        conditions, _ = self._prepare(given, weights, source_sensor)
         return self._condition(conditions, bridge, RunReport())
 
     def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
@@ -164,10 +163,8 @@ class XToTouchPipeline(UniTouchPipeline):
         touch: ImageInput = None, sensor: SensorNames = None, background: ImageInput = None,
         weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
-        num_images_per_prompt: int = 1, num_candidates: int = 1,
-        sampling_rate: int | None = None, source_sensor: SensorNames = None,
+        num_images_per_prompt: int = 1, source_sensor: SensorNames = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
         generator: Generators = None, latents: Tensor | None = None, condition_embeds: Tensor | None = None,
         output_type: str = "pil", return_dict: bool = True,
@@ -192,12 +189,9 @@ class XToTouchPipeline(UniTouchPipeline):
                 embeddings). Default: if a bank is present.
             num_inference_steps, guidance_scale: See there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
-            num_candidates: Candidates for each returned touch image; the one whose touch embedding is nearest to the
-                condition is returned.
-            sampling_rate: Rate of sounds that are arrays without one, Hz.
             source_sensor: Sensor that took `touch`: a name, one for each, or `None` to retrieve it.
-            generator: One, or one for each candidate.
-            latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
+            generator: One, or one for each touch image.
+            latents: Unit-variance noise (B n, C, h, w), n touch images of each input.
             condition_embeds: (B, 1, D) in place of the modalities, used unchanged; see `encode_condition`.
             callback_on_step_end_tensor_inputs: Tensors passed to it: "latents" (B n, C, h, w) in float32,
                 "condition_embeds" of both branches, the unconditional one (zeros) first.
@@ -207,28 +201,25 @@ class XToTouchPipeline(UniTouchPipeline):
 
             >>> pipe = unitouch_gen.tiny("x-to-touch")
             >>> pipe(text="rough brick", sensor="digit").images[0].save("brick.png")
-            >>> pipe(image="wall.jpg", num_candidates=4).images[0].save("wall.png")
+            >>> pipe(image="wall.jpg").images[0].save("wall.png")
         """
         # 1. Check inputs, before any network runs
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions: Conditions = {}
         if condition_embeds is None:
             bridge = self._check_bridge(bridge)
-            conditions, inputs = self._prepare(given, weights, sampling_rate, source_sensor)
+            conditions, inputs = self._prepare(given, weights, source_sensor)
         else:
             embeds = check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
-            given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
+            given |= {"weights": weights, "source_sensor": source_sensor}
             check_unused("condition_embeds", **given, bridge=bridge or None)
             inputs = len(embeds)
         gels, sensor_labels = self._check_sensor(sensor, background, inputs)
         batch_size = len(sensor_labels)
-        candidates = check_integer("num_candidates", num_candidates, 1, MAX_IMAGES)
-        if candidates > 1:
-            self._joint("num_candidates")
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES) * candidates
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
+            steps=self._check_steps(num_inference_steps, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
@@ -237,8 +228,7 @@ class XToTouchPipeline(UniTouchPipeline):
 
         # 2. Encode the condition
         report = RunReport()
-        encoded = {*conditions, *(["touch"] if candidates > 1 else [])}
-        report.left_out += [f"{name} encoder" for name in MODALITIES if name not in encoded]
+        report.left_out += [f"{name} encoder" for name in MODALITIES if name not in conditions]
         if conditions:
             with report.stage("condition"):
                 embeds = self._condition(conditions, bool(bridge), report, throw)
@@ -254,12 +244,9 @@ class XToTouchPipeline(UniTouchPipeline):
         with report.stage("denoising"):
             result = self._denoise(settings, hidden_states, labels, report, extra_channels=extra_channels)
 
-        # 4. Decode the finite samples; of candidates the best of each
+        # 4. Decode the finite samples
         with report.stage("decoding"):
-            if candidates == 1:
-                images = self._images(settings, result, report)
-            else:
-                images = self._best(settings, result, embeds, sensor_labels, candidates, report)
+            images = self._images(settings, result, report)
         self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
@@ -274,42 +261,12 @@ class XToTouchPipeline(UniTouchPipeline):
         latents = self.backgrounds.latents.float()[labels].to(settings.device)
         return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
-    def _best(
-        self,
-        settings: CallSettings,
-        latents: Tensor,
-        condition: Tensor,
-        sensor_labels: list[int],
-        candidates: int,
-        report: RunReport,
-    ) -> Any:
-        """The candidate of each group whose touch embedding has the largest cosine to the condition (B, 1, D)."""
-        pixels = self._decode(latents, report, settings.throw)
-        rows = [row for row, code in enumerate(report.codes) if code.finite]
-        best: dict[int, tuple[float, int]] = {}  # by group: score, and index in `rows`
-        if rows:
-            values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
-            inputs = [row // settings.repeats for row in rows]
-            known = [name if name in self.unitouch.sensors else None for name in [*self.config.sensors, None]]
-            matches = self.unitouch.match_sensors(values, [known[sensor_labels[one]] for one in inputs])
-            embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
-            scores = F.cosine_similarity(embeds, condition[inputs, 0].to(embeds), dim=1).tolist()
-            for place, (row, score) in enumerate(zip(rows, scores, strict=True)):
-                best[row // candidates] = max(best.get(row // candidates, (-2.0, 0)), (score, place))
-        report.chosen = [rows[place] for _, place in best.values()]
-        report.scores = [score for score, _ in best.values()]
-        if settings.output_type == "latent":
-            return latents[report.chosen]
-        chosen = pixels[[place for _, place in best.values()]]
-        return self.image_processor.postprocess(chosen, output_type=settings.output_type)
-
     # Checks -----------------------------------------------------------------------------------------------------------
 
     def _prepare(
         self,
         given: Mapping[str, Any],
         weights: Mapping[str, float] | None,
-        sampling_rate: int | None,
         source_sensor: SensorNames,
     ) -> tuple[Conditions, int]:
         """Reads the given modalities; also returns the number of inputs, B."""
@@ -319,8 +276,6 @@ class XToTouchPipeline(UniTouchPipeline):
         self._joint(next(iter(given)))
         if source_sensor is not None and "touch" not in given:
             raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
-        if sampling_rate is not None and "audio" not in given:
-            raise InvalidInputError("`sampling_rate` has no effect without `audio`; leave it out.")
         inputs: dict[str, Any] = {}
         if "image" in given:
             inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
@@ -330,7 +285,7 @@ class XToTouchPipeline(UniTouchPipeline):
                     raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
             inputs["text"] = dict(self.processor.text(given["text"]))
         if "audio" in given:
-            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
+            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], audible=True)}
         if "touch" in given:
             inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
         sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]

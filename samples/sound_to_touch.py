@@ -39,7 +39,6 @@ def main() -> None:
         touches = pipe(
             audio=file,
             sensor=sensors,
-            num_candidates=4,
             generator=torch.Generator().manual_seed(arguments.seed),
         ).images
         for axis, touch, sensor in zip(axes[row, 1:], touches, sensors, strict=True):

@@ -28,9 +28,8 @@ def main() -> None:
         pipe(
             text=text,
             sensor=sensors,
-            num_candidates=4,
             # The same noise for every sensor.
-            generator=[torch.Generator().manual_seed(arguments.seed + i) for _ in sensors for i in range(4)],
+            generator=[torch.Generator().manual_seed(arguments.seed) for _ in sensors],
         ).images
         for text in arguments.texts
     ]

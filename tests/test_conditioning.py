@@ -6,7 +6,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, StableUnCLIPI
 from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
-from unitouch_gen.conditioning import apply_strength, match_norm, noise_embeddings
+from unitouch_gen.conditioning import match_norm, noise_embeddings
 
 D = 16
 
@@ -30,7 +30,7 @@ def embeds() -> torch.Tensor:
     return torch.randn(5, D, generator=torch.Generator().manual_seed(1))
 
 
-# Norm and strength ----------------------------------------------------------------------------------------------------
+# Norm -----------------------------------------------------------------------------------------------------------------
 
 
 def test_every_embedding_gets_the_norm_and_keeps_its_direction(embeds):
@@ -43,11 +43,6 @@ def test_the_zero_vector_stays_zero(embeds):
     embeds[2] = 0.0
     matched = match_norm(embeds, 20.0)
     assert not matched[2].any() and torch.isfinite(matched).all()
-
-
-def test_strength_is_a_gain(embeds):
-    for strength in (0.0, 0.75, 3.0):
-        torch.testing.assert_close(apply_strength(embeds, strength), strength * embeds)
 
 
 # Noising --------------------------------------------------------------------------------------------------------------

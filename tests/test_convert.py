@@ -25,8 +25,6 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
 
-QUIET = {"log_fn": lambda line: None}
-
 
 @pytest.fixture(scope="module")
 def small_files(tmp_path_factory) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
@@ -46,7 +44,7 @@ def networks(small_files) -> dict[str, torch.nn.Module]:
 
 @pytest.fixture(scope="module")
 def model(files) -> UniTouchModel:
-    return read_published(**files, config=small(), **QUIET)
+    return read_published(**files, config=small())
 
 
 def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> torch.Tensor:
@@ -81,18 +79,16 @@ def test_clips_of_a_sound_are_averaged_as_imagebind_does(networks, model):
 
 
 def test_one_file_brings_its_encoders_alone_in_the_dtype_asked_for_and_is_not_changed(files):
-    before, lines = files["touch"].read_bytes(), []
-    touch = read_published(touch=files["touch"], config=small(), dtype=torch.bfloat16, log_fn=lines.append)
+    before = files["touch"].read_bytes()
+    touch = read_published(touch=files["touch"], config=small(), dtype=torch.bfloat16)
     assert touch.loaded_modalities == ("touch",) and len(touch.sensor_bank) == 0
     assert {weight.dtype for weight in touch.parameters()} == {torch.bfloat16} == {touch.dtype}
-    assert lines[0].startswith("Used of last_new.ckpt: modality_heads.touch (3)")
-    assert lines[1].startswith("Ignored of last_new.ckpt: modality_heads.vision (3)")
-    own = read_published(touch=files["touch"], config=small(), **QUIET)
+    own = read_published(touch=files["touch"], config=small())
     with torch.no_grad():
         for weight in own.parameters():
             weight.zero_()
     assert files["touch"].read_bytes() == before
-    others = read_published(imagebind=files["imagebind"], config=small(), **QUIET)
+    others = read_published(imagebind=files["imagebind"], config=small())
     assert others.loaded_modalities == ("image", "text", "audio")
 
 
@@ -110,7 +106,6 @@ HEAD = "modality_heads.touch.2.weight"
         (lambda state: state.pop("modality_trunks.touch.blocks.0.attn.bias_k"), "blocks.0.attn.bias_k is missing"),
         (edit(HEAD, lambda head: head[:, :-1]), r"heads.touch.2.weight is \(32, 63\) instead of \(32, 64\)"),
         (edit(HEAD, lambda head: head.long()), "heads.touch.2.weight is missing"),
-        (edit(HEAD, lambda head: head.fill_(1e6)), r"`dtype` is torch.float16, in which .*weight of `touch` overflows"),
     ],
 )
 def test_files_of_another_network_change_nothing(tmp_path, change, words):
@@ -118,16 +113,14 @@ def test_files_of_another_network_change_nothing(tmp_path, change, words):
     change(state)
     torch.save(state, tmp_path / "edited.ckpt")
     with pytest.raises(InvalidInputError, match=words):
-        convert_published(
-            tmp_path / "model", touch=tmp_path / "edited.ckpt", config=small(), dtype=torch.float16, **QUIET
-        )
+        convert_published(tmp_path / "model", touch=tmp_path / "edited.ckpt", config=small(), dtype=torch.float16)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.ckpt"]
 
 
 def test_files_that_are_exchanged_or_left_out_are_told(files):
     for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
         with pytest.raises(InvalidInputError, match=r"`touch` is for UniTouch's last_new.ckpt"):
-            read_published(**{name: files[other]}, config=small(), **QUIET)
+            read_published(**{name: files[other]}, config=small())
     with pytest.raises(InvalidInputError, match=r"Pass `touch`, `imagebind` or both"):
         read_published(config=small())
     with pytest.raises(InvalidInputError, match="`config` names sensors"):
@@ -221,7 +214,7 @@ def tokenizer_folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def folder(files, tmp_path_factory, tokenizer_folder) -> Path:
     folder = tmp_path_factory.mktemp("converted")
-    convert_published(folder, **files, config=small(), tokenizer=tokenizer_folder, **QUIET)
+    convert_published(folder, **files, config=small(), tokenizer=tokenizer_folder)
     return folder
 
 
@@ -237,33 +230,18 @@ def test_the_folder_is_the_model_of_the_files_and_its_processor_fits(model, fold
     assert processor.image_size == 28 and again.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 32)
 
 
-def test_one_file_after_the_other_makes_the_same_folder(files, folder, tmp_path, contents, tokenizer_folder):
-    lines: list[str] = []
-    for name in ("touch", "imagebind"):
-        words = {"tokenizer": tokenizer_folder} if name == "imagebind" else {}
-        convert_published(tmp_path / "model", **{name: files[name]}, config=small(), log_fn=lines.append, **words)
-    assert lines[2].startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
-    assert lines[-1] == "Missed: sensor tokens, which were not published"
-    whole, found = contents(folder), contents(tmp_path / "model")
-    assert found["model.safetensors"] == whole["model.safetensors"] and found.keys() == whole.keys()
-
-
-@pytest.mark.parametrize("there", ["another model", "a pipeline", "broken settings", "a file"])
+@pytest.mark.parametrize("there", ["a model", "a pipeline", "a file"])
 def test_what_else_is_there_is_not_written_over(files, folder, tmp_path, contents, there):
     output = tmp_path / "model"
     if there == "a file":
         output.write_text("notes")
     else:
         shutil.copytree(folder, output)
-    if there == "another model":
-        UniTouchConfig.from_dict(small().to_dict() | {"sensors": ["digit"]}).save_pretrained(output)
-    elif there == "a pipeline":
-        (output / "model_index.json").write_text("{}")
-    elif there == "broken settings":
-        (output / "config.json").write_text("{")
+    if there == "a pipeline":
+        (output / "config.json").rename(output / "model_index.json")
     before = contents(tmp_path)
-    with pytest.raises(InvalidInputError, match=r"`output`|`pretrained_model_name_or_path`"):
-        convert_published(output, touch=files["touch"], config=small(), **QUIET)
+    with pytest.raises(InvalidInputError, match="`output`"):
+        convert_published(output, touch=files["touch"], config=small())
     assert contents(tmp_path) == before
 
 

@@ -215,9 +215,8 @@ def save_modalities(
 ) -> None:
     """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
     config = deepcopy(model.config)
-    measured = ("temperatures",) if "touch" in modalities else ("temperatures", "ood_thresholds", "sensor_reaches")
-    for name in measured:
-        setattr(config, name, {})  # of other weights
+    if "touch" not in modalities:
+        config.ood_thresholds, config.sensor_reaches = {}, {}  # of other weights
     config.save_pretrained(folder)
     processor.save_pretrained(folder)
     state = {

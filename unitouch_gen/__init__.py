@@ -32,46 +32,25 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "SensorBank": "models",
-    "StemmedCLIPVisionModel": "models",
-    "UniTouchConfig": "models",
-    "UniTouchModel": "models",
-    "UniTouchProcessor": "models",
-    "InvalidInputError": "errors",
-    "InvalidTypeError": "errors",
-    "NonFiniteError": "errors",
-    "TactileStylizationPipeline": "pipelines",
-    "TouchToImagePipeline": "pipelines",
-    "TouchToTextPipeline": "pipelines",
-    "UniTouchPipelineOutput": "pipelines",
-    "XToTouchPipeline": "pipelines",
-    "example": "examples",
-    "tiny": "pipelines.tiny",
+    "errors": ("InvalidInputError", "InvalidTypeError", "NonFiniteError"),
+    "examples": ("example",),
+    "models": ("SensorBank", "StemmedCLIPVisionModel", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor"),
+    "pipelines.tiny": ("tiny",),
 }
+"""Modules of names; the others are of `pipelines`."""
 
 __all__ = [
-    "InvalidInputError",
-    "InvalidTypeError",
-    "NonFiniteError",
-    "SensorBank",
-    "StemmedCLIPVisionModel",
-    "TactileStylizationPipeline",
-    "TouchToImagePipeline",
-    "TouchToTextPipeline",
-    "UniTouchConfig",
-    "UniTouchModel",
-    "UniTouchPipelineOutput",
-    "UniTouchProcessor",
-    "XToTouchPipeline",
-    "example",
-    "tiny",
-]
+    "InvalidInputError", "InvalidTypeError", "NonFiniteError", "SensorBank", "StemmedCLIPVisionModel",
+    "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline", "UniTouchConfig", "UniTouchModel",
+    "UniTouchPipelineOutput", "UniTouchProcessor", "XToTouchPipeline", "example", "tiny",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home = next((module for module, names in _HOMES.items() if name in names), "pipelines")
+    return getattr(import_module(f"{__name__}.{home}"), name)
 
 
 def __dir__() -> list[str]:

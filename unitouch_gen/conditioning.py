@@ -1,8 +1,8 @@
 """From embeddings of the joint space to the conditioning of a denoising network.
 
-The steps, in order: rescaling to the norm of image embeddings (`match_norm`), bridge (`bridge_nearest`), strength
-(`apply_strength`), noising (`noise_embeddings`). InfoNCE fixes only directions: without the first step the unCLIP's
-normaliser would see an embedding of the wrong scale.
+The steps, in order: rescaling to the norm of image embeddings (`match_norm`), bridge (`bridge_nearest`), strength (a
+factor; Section 4.4 of the paper), noising (`noise_embeddings`). InfoNCE fixes only directions: without the first step
+the unCLIP's normaliser would see an embedding of the wrong scale.
 """
 
 import sys
@@ -26,11 +26,6 @@ def match_norm(embeds: Tensor, norm: float) -> Tensor:
     """Each embedding (..., D) scaled to an L2 norm; the zero vector stays zero."""
     length = embeds.norm(dim=-1, keepdim=True)
     return norm * embeds / torch.where(length > 0, length, 1.0)
-
-
-def apply_strength(embeds: Tensor, strength: float) -> Tensor:
-    """e <- s e (Section 4.4 of the paper: s = 0.75 for touch-to-image)."""
-    return strength * embeds
 
 
 def noise_embeddings(

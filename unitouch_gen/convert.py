@@ -11,8 +11,7 @@ import os
 import pickle
 import re
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,9 +28,6 @@ from unitouch_gen.models.sensors import SensorBank
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 """Which encoders are read from which file."""
-
-PUBLISHED_NAMES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
-"""The modalities, M, as the published files call them."""
 
 # The layout -----------------------------------------------------------------------------------------------------------
 
@@ -116,7 +112,7 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
     short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats that of image and text
     for pattern, template, rule in RENAMINGS[modality]:
         if match := re.fullmatch(pattern, short):
-            return match.expand(template.replace("M", PUBLISHED_NAMES[modality], 1)), rule
+            return match.expand(template.replace("M", "vision" if modality == "image" else modality, 1)), rule
     raise KeyError(key)
 
 
@@ -129,7 +125,6 @@ def read_published(
     *,
     config: UniTouchConfig | None = None,
     dtype: torch.dtype | None = None,
-    log_fn: Callable[[str], object] = print,
 ) -> UniTouchModel:
     """A joint space of the published checkpoints.
 
@@ -138,7 +133,6 @@ def read_published(
         imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are read.
         config: Sizes of encoders other than the published ones, without sensors.
         dtype: Precision of the weights; the file's own when left out.
-        log_fn: Gets lines on what was used, ignored and missed.
 
     Raises:
         InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
@@ -158,33 +152,22 @@ def read_published(
             continue
         path = as_path(name, path)
         keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, path).items()}
-        used: set[str] = set()
         for modality in FILES[name]:
-            tensors = _encoder_in(f"`{name}` names {str(path)!r}, which", keys, config, modality, used)
+            tensors = _encoder_in(f"`{name}` names {str(path)!r}, which", keys, config, modality)
             if not model.loaded_modalities:
                 model.to(wanted or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
-            _check_range(name, model, modality)
-        log_fn(f"Used of {path.name}: {counted(used)}")
-        if ignored := keys.keys() - used:
-            log_fn(f"Ignored of {path.name}: {counted(ignored)}")
     return model
 
 
-def _encoder_in(
-    subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str, used: set[str]
-) -> dict[str, Tensor]:
-    """The tensors of a modality in a published file of tensors `keys`, by our keys.
-
-    `subject` begins messages; `used` gets the keys that were used.
-    """
+def _encoder_in(subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str) -> dict[str, Tensor]:
+    """The tensors of a modality in a published file of tensors `keys`, by our keys; `subject` begins messages."""
     found, wrong = {}, []
     with torch.device("meta"):
         encoder = make_modules(config, modality)[MODULES[modality][0]]
         shapes = {key: tuple(tensor.shape) for key, tensor in encoder.state_dict().items()}
     for key, shape in shapes.items():
         source, rule = published_name(modality, key)
-        used.add(source)
         if source not in keys or tuple(keys[source].shape) != rule.shape(shape):
             there = tuple(keys[source].shape) if source in keys else "missing"
             wrong.append(f"{source} is {there} instead of {rule.shape(shape)}")
@@ -199,15 +182,6 @@ def _encoder_in(
         bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
         found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
     return found
-
-
-def _check_range(name: str, model: UniTouchModel, modality: str) -> None:
-    """Refuses a dtype in which weights became infinite."""
-    for key, weight in getattr(model, MODULES[modality][0]).named_parameters():
-        if not bool(weight.isfinite().all()):
-            raise InvalidInputError(
-                f"`dtype` is {model.dtype}, in which {key} of `{name}` overflows; use torch.bfloat16."
-            )
 
 
 class Inert:
@@ -266,12 +240,6 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     return tensors
 
 
-def counted(keys: Iterable[str]) -> str:
-    """Keys by the first two parts of their names, with how many there are: "modality_trunks.depth (144), ..."."""
-    counts = Counter(".".join(key.split(".")[:2]) for key in keys)
-    return ", ".join(f"{part} ({count})" for part, count in sorted(counts.items())[:20])
-
-
 def read_config(name: str, file: Path) -> UniTouchConfig:
     """Sizes of a joint space, from its config.json, which the user passed as the argument `name`."""
     settings = read_settings(name, file)
@@ -291,16 +259,16 @@ def convert_published(
     tokenizer: str | os.PathLike | None = None,
     config: UniTouchConfig | None = None,
     dtype: torch.dtype | None = None,
-    log_fn: Callable[[str], object] = print,
-) -> None:
+) -> list[str]:
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
-
-    A folder that holds other encoders of the same sizes is added to.
 
     Args:
         output: The folder.
-        touch, imagebind, config, dtype, log_fn: See `read_published`.
+        touch, imagebind, config, dtype: See `read_published`.
         tokenizer: Folder of the tokenizer of text: OpenCLIP's, as in Stable Diffusion 2.1 unCLIP.
+
+    Returns:
+        What the folder lacks, in words.
 
     Raises:
         InvalidInputError: See `read_published`; or if the output holds something else or cannot be written to. Nothing
@@ -308,28 +276,14 @@ def convert_published(
     """
     output = as_path("output", output)
     words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
-    model = read_published(touch, imagebind, config=config, dtype=dtype, log_fn=log_fn)
-    if (output / "model_index.json").exists():
-        raise InvalidInputError(f"`output` is {str(output)!r}, which holds a pipeline; name another folder.")
-    if (output / "config.json").exists():
-        _add_encoders_of(output, model)
+    model = read_published(touch, imagebind, config=config, dtype=dtype)
+    if any((output / file).exists() for file in ("model_index.json", "config.json")):
+        raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
-    if not words and not (output / "tokenizer_config.json").is_file():
+    if not words:
         lacks.append("a tokenizer, which `tokenizer` would bring")
     with writing_folder("output", output) as folder:
         model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
-    log_fn(f"Missed: {'; '.join(lacks)}")
-
-
-def _add_encoders_of(folder: Path, model: UniTouchModel) -> None:
-    """Adds the encoders that a folder holds and a model lacks; raises if it holds a joint space of other sizes."""
-    known = UniTouchModel.from_pretrained(folder, dtype=model.dtype)
-    ours, theirs = model.config.to_dict(), known.config.to_dict()
-    if any(theirs[name] != ours[name] for name in ours if name.endswith("_config")) or known.config.sensors:
-        raise InvalidInputError(f"`output` is {str(folder)!r}, which holds another model; name another folder.")
-    for modality in set(known.known_modalities) - set(model.loaded_modalities):
-        for name, module in zip(MODULES[modality], known.load(modality), strict=True):
-            setattr(model, name, module)
-    model.config.embedding_norm = known.config.embedding_norm
+    return lacks

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -50,8 +49,10 @@ class ReturnCode(StrEnum):
     SUCCESS = "success", "The sample is finite."
     NON_FINITE = "non_finite", "Not finite. Lower `guidance_scale` or `strength`, take more steps, or run in float32."
     DIVERGED = "diverged", "Far larger than the latents of pictures. Lower `guidance_scale`, or take more steps."
-    MAX_EVALUATIONS = "max_evaluations", "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`."
-    STEP_TOO_SMALL = "step_too_small", "Unfinished. Allow a larger `tolerance`, lower `guidance_scale`, or use float32."
+    MAX_EVALUATIONS = (
+        "max_evaluations",
+        "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`.",
+    )
     INTERRUPTED = "interrupted", "Interrupted, with noise left in the sample. Call again to finish it."
 
     @property
@@ -77,8 +78,6 @@ class RunReport:
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)
-    chosen: list[int] = field(default_factory=list)  #: indices of the samples chosen among candidates
-    scores: list[float] = field(default_factory=list)  #: cosine of each chosen sample's embedding to the condition
     left_out: list[str] = field(default_factory=list)  #: parts that were not needed and did not run
 
     @property
@@ -133,8 +132,6 @@ def prepare_steps(
     *,
     solver: str | None = None,
     num_inference_steps: int | None = None,
-    timesteps: Sequence[int] | None = None,
-    sigmas: Sequence[float] | None = None,
     tolerance: float | None = None,
     max_evaluations: int | None = None,
     eta: float = 0.0,
@@ -143,68 +140,53 @@ def prepare_steps(
 ) -> Steps:
     """Validates the step arguments of a call, before any network runs.
 
-    One of `num_inference_steps` (default 50), `timesteps`, `sigmas`, which end in 0, and `tolerance`, a relative RMS
-    error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of the pipeline's own
-    scheduler runs; otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of
-    a tolerance, `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of
-    the way to noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or
-    `InvalidTypeError` if steps are impossible or arguments exclude each other.
+    `num_inference_steps` (default 50) or `tolerance`, a relative RMS error of the latents from 1e-5 to 1, sets the
+    steps. Without `solver` and `tolerance` a copy of the pipeline's own scheduler runs; otherwise only its noise levels
+    and prediction type are used. `max_evaluations` (default 1000) is of a tolerance, `eta` of DDIM. `init_strength` is
+    the share of the steps to run (img2img): they begin at that share of the way to noise, in the spacing of the solver
+    or scheduler, whatever their number. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or
+    arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
-    given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
-    given |= {"num_inference_steps": num_inference_steps}
-    if tolerance is not None:
-        given |= {"solver": solver, "eta": eta or None}
-    given = {name: value for name, value in given.items() if value is not None} or {"num_inference_steps": 50}
-    if len(given) > 1:
-        first, second, *_ = given
-        raise InvalidInputError(
-            f"`{second}` is {describe(given[second])}, but `{first}` was given, which sets the steps; leave one out."
-        )
-    if tolerance is None and max_evaluations is not None:
-        raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but needs a `tolerance`; leave it out.")
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
-    [(name, value)] = given.items()
-    levels = config.get("num_train_timesteps", 1000)
-    if name == "num_inference_steps":
-        value = check_integer(name, value, 1, levels)
-    elif name != "tolerance":
-        value = check_falling(name, value, levels - 1 if name == "timesteps" else math.inf)
-        total = len(value) - (name == "sigmas")
-        count = round(init_strength * total)
-        if init_strength < 1.0 and not 0 < count < total:
-            raise InvalidInputError(f"`init_strength` is {init_strength:g}, which begins at none of {total} `{name}`.")
-        value = value[total - count :]
-    if solver is None and tolerance is None:
-        return prepare_scheduler(copy.deepcopy(scheduler), name, value, eta, init_strength, device)
-
+    if tolerance is None:
+        if max_evaluations is not None:
+            raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but needs a `tolerance`; leave it out.")
+        levels = config.get("num_train_timesteps", 1000)
+        whole = 50 if num_inference_steps is None else num_inference_steps
+        count = max(round(init_strength * check_integer("num_inference_steps", whole, 1, levels)), 1)
+        if solver is None:
+            return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
     schedule, prediction_type = NoiseSchedule.of(scheduler), config.get("prediction_type")
     check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
-    if tolerance is not None:
-        check_number("tolerance", tolerance, 1e-5, 1.0)
-        limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
-        start = schedule.karras_level(1.0 - init_strength)
-        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
-    solver = check_choice("solver", solver, SOLVERS)
-    if name == "num_inference_steps":
-        value = [*SOLVERS[solver].spacing(schedule, max(round(init_strength * value), 1), init_strength), 0.0]
-    elif name == "timesteps":
-        value = [*schedule.sigma(torch.tensor(value)).tolist(), 0.0]
-    return Steps(solver, len(value) - 1, value, schedule, prediction_type, eta=eta)
+    if tolerance is None:
+        solver = check_choice("solver", solver, SOLVERS)
+        sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
+        return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
+    for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
+        if value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but `tolerance` was given, which sets the steps; leave one out."
+            )
+    check_number("tolerance", tolerance, 1e-5, 1.0)
+    limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
+    start = schedule.karras_level(1.0 - init_strength)
+    return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
 
 
 def prepare_scheduler(
-    scheduler: Any, name: str, value: Any, eta: float, init_strength: float, device: torch.device | str
+    scheduler: Any, count: int, eta: float, init_strength: float, device: torch.device | str
 ) -> Steps:
-    """Sets the timesteps of a diffusers scheduler by an argument of its `set_timesteps`."""
-    kind, words = type(scheduler).__name__, f"`{name}` is {describe(value)}"
-    if name not in inspect.signature(scheduler.set_timesteps).parameters:
-        raise InvalidInputError(f"{words}, but {kind} chooses its own steps; leave it out, or name a `solver`.")
+    """Sets the timesteps of a diffusers scheduler."""
+    kind, words = type(scheduler).__name__, f"`num_inference_steps` is {count}"
+    options: dict[str, Any] = {"device": device}
     try:
-        if name == "num_inference_steps" and init_strength < 1.0:
-            scheduler, value = begun_within(scheduler, init_strength), max(round(init_strength * value), 1)
-        scheduler.set_timesteps(**{name: value}, device=device)
+        if "strength" in inspect.signature(scheduler.set_timesteps).parameters:  # as of LCM and TCD
+            options["strength"] = init_strength
+        elif init_strength < 1.0:
+            scheduler = begun_within(scheduler, init_strength)
+        scheduler.set_timesteps(count, **options)
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
@@ -213,10 +195,9 @@ def prepare_scheduler(
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
-    steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM leaves it unset for custom timesteps
     if hasattr(scheduler, "set_begin_index"):
         scheduler.set_begin_index(0)  # without it diffusers starts at the second of two equal timesteps
-    return Steps(kind, steps, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
+    return Steps(kind, scheduler.num_inference_steps, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
 
 
 def begun_within(scheduler: Any, share: float) -> Any:
@@ -230,18 +211,6 @@ def begun_within(scheduler: Any, share: float) -> Any:
     own = {"num_train_timesteps": levels, "trained_betas": betas[:levels].tolist(), "timestep_spacing": "trailing",
            "rescale_betas_zero_snr": False}  # fmt: skip
     return type(scheduler).from_config(config, **{name: value for name, value in own.items() if name in config})
-
-
-def check_falling(name: str, values: Any, high: float) -> list[float]:
-    """Falling timesteps, or falling noise levels that end in 0."""
-    numbers = values.tolist() if hasattr(values, "tolist") else list(check_kind(name, values, list, tuple))
-    for place, number in enumerate(numbers):
-        check_number(f"{name}[{place}]", number, 0.0, high)
-    wrong_end = name == "sigmas" and (numbers[-1:] != [0.0] or len(numbers) < 2)
-    if not numbers or wrong_end or any(after >= before for before, after in pairwise(numbers)):
-        wanted = "numbers, each below the one before" + (", that end in 0" if name == "sigmas" else "")
-        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to be {wanted}.")
-    return numbers
 
 
 # Guidance -------------------------------------------------------------------------------------------------------------
@@ -351,7 +320,7 @@ def run_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -
     run.latents, run.sigma = x * alpha(sigma), sigma
     if steps.tolerance is not None:
         ends, active = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
-        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_rejection, active)
+        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, active)
     options: dict[str, Any] = {}
     if steps.solver == "ddim":
         options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
@@ -435,8 +404,3 @@ class Run:
         else:
             self.progress(1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last))
         return x
-
-    def after_rejection(self, step: float) -> None:
-        """Called after each rejected adaptive step with its size in log sigma."""
-        if step <= 1e-4:  # below it float32 cannot tell states apart
-            raise _EndedError(ReturnCode.STEP_TOO_SMALL)

@@ -38,7 +38,10 @@ def sample_ddim(
     eta: float = 0.0,
     draw: Callable[[Tensor], Tensor] = torch.randn_like,
 ) -> Tensor:
-    """DDIM, of order 1; at eta = 1 it adds as much noise as DDPM (Song et al., 2021, Equations 12 and 16)."""
+    """DDIM, of order 1; at eta = 1 it adds as much noise as DDPM (Song et al., 2021, Equations 12 and 16).
+
+    At eta = 0 it is the method of Euler.
+    """
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         denoised = denoise(x, sigma)
         added = eta * target * math.sqrt(1 - (target / sigma) ** 2)
@@ -46,14 +49,6 @@ def sample_ddim(
         if added > 0.0:
             x = x + added * draw(x)
         x = after_step(step, x, target)
-    return x
-
-
-def sample_euler(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """Euler, of order 1 (the first half of Algorithm 1 of Karras et al., 2022)."""
-    for step, (sigma, target) in enumerate(pairwise(sigmas)):
-        slope = (x - denoise(x, sigma)) / sigma
-        x = after_step(step, x + (target - sigma) * slope, target)
     return x
 
 
@@ -164,14 +159,13 @@ def sample_adaptive(
     ends: tuple[float, float],
     tolerance: float,
     after_step: AfterStep,
-    after_rejection: Callable[[float], object],
     active: Callable[[], Sequence[bool]],
 ) -> Tensor:
     """Adaptive steps from the first to the second of two sigmas, for a relative RMS tolerance of the result.
 
     A predictor of order 2 and a corrector of order 3 are an embedded pair: their difference is the local error. A step
     costs one evaluation, accepted or not. The whole batch shares its steps; the largest error of the `active` samples
-    decides. `after_rejection` gets the size in log sigma of a rejected step.
+    decides. Steps are at least 1e-4 in log sigma: below, float32 cannot tell states apart.
     """
     local_tolerance = 0.5 * tolerance  # errors partly cancel, and the corrector is better than the predictor
     (sigma, last), accepted, last_error = ends, 0, 1.0
@@ -185,9 +179,7 @@ def sample_adaptive(
         corrected = exponential_integral([*levels[-2:], ahead], sigma, target)
         error = local_error(corrected - predicted, *ahead, active()) / local_tolerance
         proposed = next_step(step, error, last_error, order=len(levels[-2:]) + 1)
-        if error > 1.0:
-            after_rejection(step)
-        else:
+        if error <= 1.0:
             levels.append(ahead)
             x = after_step(accepted, target / sigma * x + corrected, target)
             sigma, last_error, accepted = target, max(error, 1e-4), accepted + 1
@@ -239,7 +231,7 @@ class Solver:
 SOLVERS: dict[str, Solver] = {
     "ddim": Solver(sample_ddim, 1, NoiseSchedule.trailing),
     # Levels even in time are too far apart near the end, which limits multistep solvers to first order.
-    "euler": Solver(sample_euler, 1, NoiseSchedule.karras),
+    "euler": Solver(sample_ddim, 1, NoiseSchedule.karras),
     "heun": Solver(sample_heun, 2, NoiseSchedule.karras),
     "dpm++2m": Solver(sample_dpmpp_2m, 2, NoiseSchedule.karras),
     "unipc": Solver(sample_unipc, 3, NoiseSchedule.karras),

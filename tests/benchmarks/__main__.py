@@ -22,13 +22,12 @@ from rich.console import Console
 
 from tests.benchmarks.adaptation import adapt_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
-from tests.benchmarks.measuring import Figures, in_turns, quiet, seconds_of
+from tests.benchmarks.measuring import Figures, in_turns, machine, quiet, seconds_of
 from tests.benchmarks.quality import quality_figures
 from tests.benchmarks.tables import write_pages
 from tests.benchmarks.world import world_figures
 from unitouch_gen import example, weights
 from unitouch_gen.files import write_file
-from unitouch_gen.numerics.work_precision import machine
 
 
 def speed_figures() -> Figures:

@@ -17,7 +17,7 @@ from torch import Tensor
 from tests.benchmarks.measuring import Figures, attribute_agreement
 from unitouch_gen.evaluation.contacts import Contacts, image_embeddings
 from unitouch_gen.evaluation.controls import class_means, with_controls
-from unitouch_gen.evaluation.metrics import calibration_error, retrieval, share_right
+from unitouch_gen.evaluation.metrics import retrieval, share_right
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DrawnContacts
@@ -65,13 +65,11 @@ class JointSpace:
 
 
 def material_rows(joint: JointSpace, modality: str, features: Tensor, material: Tensor) -> Figures:
-    """The share of embeddings whose "material" is named right, and the "calibration error" of its probabilities."""
+    """The share of embeddings whose "material" is named right."""
     classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor)
 
     def measure(values: Tensor) -> dict[str, float]:
-        shares = classifier.probabilities(values, modality)
-        right = share_right(shares.argmax(dim=1), material)
-        return {"material": right, "calibration error": calibration_error(shares, material)}
+        return {"material": share_right(classifier.scores(values, modality).argmax(dim=1), material)}
 
     return with_controls(measure, {"value": features, "class_mean": class_means(features, material)})
 

@@ -1,8 +1,10 @@
 """What several benchmarks measure with: calls that take turns, and contacts of the world."""
 
+import platform
 import statistics
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -95,3 +97,12 @@ def over_seeds(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, d
         values = [one["value"] for one in each]
         figures[name] = {**means, "spread": max(values) - min(values)}
     return figures
+
+
+def machine() -> str:
+    """What timings depend on, in words."""
+    known = Path("/proc/cpuinfo")
+    lines = known.read_text(encoding="utf-8").splitlines() if known.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    threads = f"{torch.get_num_threads()} threads, torch {torch.__version__}"
+    return f"{(names or [platform.machine()])[0]}, {threads}"

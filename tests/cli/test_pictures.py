@@ -89,15 +89,15 @@ def test_anything_becomes_a_touch(here, run):
 
 
 def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
-    rows = run("x-to-touch --image in --text brick --sensor all --candidates 2 -o out --batch-size 3")["pictures"]
+    rows = run("x-to-touch --image in --text brick --sensor all -o out --batch-size 3")["pictures"]
     assert [Path(row["picture"]).stem for row in rows] == [
         f"{name}-brick-{sensor}" for name in ("bright", "dark") for sensor in ("gelsight", "digit")
     ]
-    run("x-to-touch --image in/dark.png --text brick --sensor digit --candidates 2 -o alone.png")
+    run("x-to-touch --image in/dark.png --text brick --sensor digit -o alone.png")
     assert same("alone.png", "out/dark-brick-digit.png")
-    run("x-to-touch --text brick -o text.png --candidates 2")
+    run("x-to-touch --text brick -o text.png")
     weights = '--set weights={"text":1,"image":0}'
-    run(f"x-to-touch --image in/dark.png --text brick -o weighed.png --candidates 2 {weights}")
+    run(f"x-to-touch --image in/dark.png --text brick -o weighed.png {weights}")
     assert same("weighed.png", "text.png", tolerance=0)
 
 

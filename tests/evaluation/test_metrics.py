@@ -8,7 +8,6 @@ from sklearn.metrics import average_precision_score
 
 from unitouch_gen.evaluation.controls import class_means, others, statistics, with_controls
 from unitouch_gen.evaluation.metrics import (
-    calibration_error,
     correlated,
     frechet_distance,
     linear_probe,
@@ -95,7 +94,7 @@ def test_what_two_views_share_is_found(method, least):
     assert mean_average_precision(*strange, rows) < 0.1
 
 
-# Distances and calibration --------------------------------------------------------------------------------------------
+# Distances ------------------------------------------------------------------------------------------------------------
 
 
 def test_the_distance_of_gaussians_is_that_of_their_moments():
@@ -106,12 +105,6 @@ def test_the_distance_of_gaussians_is_that_of_their_moments():
     expected = (shift**2).sum() + ((scale - 1.0) ** 2).sum()
     assert frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
     assert frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_calibration_error_is_the_mean_gap_between_confidence_and_accuracy():
-    sure = torch.tensor([[0.95, 0.05]] * 4 + [[0.38, 0.62]] * 2)  # right in 3 of 4 at 95 %, in 2 of 2 at 62 %
-    found = calibration_error(sure, torch.tensor([0, 0, 0, 1, 1, 1]))
-    assert found == pytest.approx((4 * (0.95 - 0.75) + 2 * (1.0 - 0.62)) / 6)
 
 
 # Probes ---------------------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def converted(folder: Path, width: int = D, imagebind: bool = True) -> Path:
     if imagebind:
         files["imagebind"] = folder / "imagebind.pth"
         torch.save(ImageBind(config).state_dict(), files["imagebind"])
-    convert_published(folder / "unitouch", **files, config=config, log_fn=lambda line: None)
+    convert_published(folder / "unitouch", **files, config=config)
     return folder / "unitouch"
 
 

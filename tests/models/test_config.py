@@ -35,7 +35,7 @@ JOINT_SPACE = [
     ({"projection_dim": "wide"}, "projection_dim"),
     ({"sensors": [1, 2]}, "sensors"),
     ({"sensors": ["digit", "gelsight", "digit"]}, "sensors"),
-    ({"temperatures": {"text": "large"}}, "temperatures"),
+    ({"sensor_reaches": {"digit": "large"}}, "sensor_reaches"),
     ({"vision_config": {"hidden_size": "wide", "projection_dim": 1024}}, "hidden_size"),
     ({"vision_config": {"stem": "relief", "projection_dim": 1024}}, "vision_config.stem"),
     ({"vision_config": {"stem": "residual", "patch_size": 12, "projection_dim": 1024}}, "patch_size"),

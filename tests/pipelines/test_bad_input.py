@@ -49,17 +49,17 @@ TO_IMAGE = {
 }  # fmt: skip
 STYLIZE = {
     "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
-    "touch_weight": ([1.2, -0.1, NAN, [0.1] * 3], ["much"]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
+    "touch_weight": ([1.2, -0.1, NAN], ["much", [0.1] * 3]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
     "init_strength": ([1.5, -0.1, NAN], ["much"]),
 }  # fmt: skip
 TO_TOUCH = {
     "text": (["  \n", ["brick", ""], []], [3]),
     "audio": ([(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
               []),
-    "sampling_rate": ([RATE], []), "source_sensor": (["digit"], []),
+    "source_sensor": (["digit"], []),
     "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []), "background": ([torch.zeros(3, 16, 16)], []),
     "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {3: 1}, {}], [[1.0]]),
-    "bridge": ([], ["london", 1]), "num_candidates": ([0], [1.5]), "condition_embeds": ([torch.ones(1, 1, 16)], []),
+    "bridge": ([], ["london", 1]), "condition_embeds": ([torch.ones(1, 1, 16)], []),
 }  # fmt: skip
 TABLES = {"pipe stylize x_to_touch": NUMBERS, "pipe stylize": TO_IMAGE, "stylize": STYLIZE, "x_to_touch": TO_TOUCH}
 # Arguments that do not fit each other; the first of them is named.
@@ -135,13 +135,12 @@ def test_what_needs_a_part_that_is_missing(components, x_components, touch):
     config = type(joint.config).from_dict(joint.config.to_dict() | {"sensors": []})
     sensorless = TouchToImagePipeline(**components | {"unitouch": UniTouchModel(config)})
     joint.sensor_bank.known.fill_(False)  # its prototypes
-    embeds, token, states = torch.ones(2, 16), torch.ones(1, 1, 16), torch.zeros(1, 12, 16)
+    embeds, states = torch.ones(2, 16), torch.zeros(1, 12, 16)
     for pipe, name, options in (
         (bare, "touch", {"touch": touch}),
         (bare, "prompt", {"touch_embeds": embeds, "prompt": "brick"}),
         (bare, "negative_prompt", {"touch_embeds": embeds, "prompt_embeds": states}),
         (alone, "text", {"text": "brick"}),
-        (alone, "num_candidates", {"condition_embeds": token, "num_candidates": 2}),
         (TouchToImagePipeline(**components), "sensor", {"touch": touch}),
         (sensorless, "sensor", {"touch": touch, "sensor": "digit"}),
         (sensorless, "background", {"touch": touch, "background": touch}),

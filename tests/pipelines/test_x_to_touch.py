@@ -1,4 +1,4 @@
-"""`XToTouchPipeline`: its conditions, its sensors and its choice of candidates."""
+"""`XToTouchPipeline`: its conditions and its sensors."""
 
 import numpy as np
 import pytest
@@ -155,24 +155,3 @@ def test_sensors_and_backgrounds_that_do_not_fit_are_refused(x_to_touch):
     assert torch.equal(*(draw(pipe, text="brick", sensor=sensor) for sensor in ("all", None)))
     with pytest.raises(InvalidInputError, match="`sensor` is 'digit'"):
         pipe(text="brick", sensor="digit")
-
-
-@torch.no_grad()
-def test_the_candidate_nearest_to_the_condition_is_chosen(x_to_touch):
-    embeds = x_to_touch.encode_condition(text=["rough brick", "smooth metal"])
-    noise, each = torch.randn(6, 3, 8, 8, generator=seeded(4)), embeds.repeat_interleave(3, dim=0)
-    options = {"sensor": "digit", "output_type": "pt"}
-    every = x_to_touch(condition_embeds=each, latents=noise, **options).images
-    values = x_to_touch.processor.touch(every)
-    features = x_to_touch.unitouch.get_touch_features(values, torch.ones(6, dtype=torch.long))
-    scores = torch.cosine_similarity(features, each[:, 0], dim=1).view(2, 3)
-    output = x_to_touch(condition_embeds=embeds, latents=noise, num_candidates=3, **options)
-    best = scores.argmax(dim=1) + torch.tensor([0, 3])
-    assert_close(output.images, every[best])
-    assert output.report.chosen == best.tolist()
-    assert output.report.scores == pytest.approx(scores.max(dim=1).values.tolist(), abs=1e-4)
-    options = {"text": ["rough brick", "smooth metal"], "num_candidates": 3}
-    assert draw(x_to_touch, **options, num_images_per_prompt=2).shape == (4, 3, 8, 8)
-    x_to_touch.unet.conv_out.bias.data.fill_(float("nan"))
-    output = x_to_touch(**options, throw=False)
-    assert output.images == [] and output.report.chosen == []

@@ -108,12 +108,12 @@ def test_a_stage_that_was_stopped_goes_on_to_the_same_bits(name: str, runs: Path
 def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(runs: Path, tmp_path: Path) -> None:
     began = shutil.copytree(runs / "image_text" / "model", tmp_path / "run" / "model")
     config = json.loads((began / "config.json").read_text())
-    (began / "config.json").write_text(json.dumps({**config, "temperatures": {"image": 0.2}}))
+    (began / "config.json").write_text(json.dumps({**config, "sensor_reaches": {"digit": 0.2}}))
     (tmp_path / "run" / "record.json").write_text('{"seed": 3}')
     changed = ("--set", "objective.views=0")
     stage(runs, "image_text", "--init", str(began), *changed, output="kept")
     made = UniTouchModel.from_pretrained(runs / "kept" / "model")
-    assert made.config.temperatures == {} and made.config.embedding_norm > 0
+    assert made.config.sensor_reaches == {} and made.config.embedding_norm > 0
     words = [UniTouchProcessor.from_pretrained(one).tokenizer.get_vocab() for one in (began, runs / "kept" / "model")]
     record = json.loads((runs / "kept" / "record.json").read_text())
     assert words[0] == words[1] and record["started_from"] == {"seed": 3}

@@ -36,5 +36,4 @@ def classify(
         return
     table = [[file.name, str(one)] for file, one in found.items()]
     options.print_table(["touch", template.replace("{}", "...")], table)
-    kept = "calibrated on" if classifier.calibrated else "not calibrated, even on"
-    echo(f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on.")
+    echo("A percentage is how sure the model is among these labels, not how often it is right.")

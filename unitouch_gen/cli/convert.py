@@ -30,9 +30,9 @@ def unitouch(
         raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
     sizes = None if config is None else read_config("--config", config)
     kind = None if dtype is None else check_dtype("--dtype", dtype)
-    convert_published(
-        output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind, log_fn=echo
-    )
+    lacks = convert_published(output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind)
+    if lacks:
+        echo(f"The files lack {', '.join(lacks)}")
     echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     echo(f"The model is in {output.resolve()}")
 

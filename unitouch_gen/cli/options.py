@@ -14,7 +14,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice
 
 SETTABLE = (
     "bridge", "eta", "guidance_scale", "height", "init_strength", "keep_colours", "layout", "max_evaluations", "mix",
-    "noise_level", "num_candidates", "num_inference_steps", "sigmas", "solver", "strength", "timesteps", "tolerance",
+    "noise_level", "num_inference_steps", "solver", "strength", "tolerance",
     "touch_weight", "weights", "width",
 )  # fmt: skip
 """Arguments of pipelines' calls that are the same for all pictures of a call."""
@@ -41,7 +41,6 @@ Tolerance = Annotated[float | None, Option(min=1e-5, max=1, help="Relative error
 Guidance = Annotated[float | None, Option("--guidance-scale", "--guidance", min=0, help="On above 1.")]
 Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: eta=0.5, bridge=false ...")]
 Images = Annotated[int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Of each input.")]
-Candidates = Annotated[int, Option("--num-candidates", "--candidates", min=1, max=10_000, help="The best is kept.")]
 Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 

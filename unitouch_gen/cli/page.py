@@ -116,7 +116,6 @@ def any_fields(pipe: Any) -> Fields:
         "audio": upload("audio", "Sound"),
         "touch": upload("touch", "Touch"),
         "sensor": gradio.Dropdown(sensors, value=sensors[0] if sensors else None, label="Sensor to draw for"),
-        "num_candidates": gradio.Slider(1, 8, 1, step=1, label="Candidates", info="Made of each; the best is kept."),
     }
 
 
@@ -155,14 +154,13 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
     seed = int(given.pop("seed", random.randrange(2**31)))
     if "tolerance" in given:
         del given["num_inference_steps"]
-    count = given["num_images_per_prompt"] * given.get("num_candidates", 1)
 
     def show(view: Any, step: int, timestep: Any, tensors: Any) -> dict[str, Any]:
         progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
         return {}
 
     with refusing(value for value in given.values() if isinstance(value, str)):
-        generator = [torch.Generator().manual_seed(seed + number) for number in range(count)]
+        generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
         output = pipe(**given, generator=generator, callback_on_step_end=show)
     felt = ""
     if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words

@@ -83,7 +83,6 @@ def x_to_touch(
     source_sensor: Annotated[str | None, Option(help="Sensor that took --touch; by its looks if left out.")] = None,
     sensor: Annotated[list[str] | None, Option(help="Sensor to draw for, the first, or all; repeatable.")] = None,
     background: options.Background = None,
-    num_candidates: options.Candidates = 1,
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
@@ -141,7 +140,7 @@ def stem_of(value: Path | str) -> str:
 def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) -> list[Picture]:
     """The pictures of rows of inputs and the names of their files; refuses what cannot be written."""
     given = context.params
-    output, images, candidates = Path(given["output"]), given["num_images_per_prompt"], given.get("num_candidates", 1)
+    output, images = Path(given["output"]), given["num_images_per_prompt"]
     each = [(inputs, stem, number) for inputs, stem in rows for number in range(images)]
     stems = unique([f"{stem}-{number + 1}" if images > 1 else stem for _, stem, number in each])
     files = [output / f"{stem}.png" for stem in stems]
@@ -154,7 +153,7 @@ def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) ->
     if read & {os.path.realpath(file) for file in files}:
         raise InvalidInputError(f"`--output` is {str(output)!r}, where an input would be replaced; name another place.")
     options.check_output(files, given["overwrite"])
-    seeds = [given["seed"] + number * candidates for _, _, number in each]
+    seeds = [given["seed"] + number for _, _, number in each]
     return [Picture(inputs, *place) for (inputs, _, _), *place in zip(each, files, seeds, strict=True)]
 
 
@@ -175,8 +174,7 @@ def draw(pipe: Any, pictures: Sequence[Picture]) -> "UniTouchPipelineOutput":
     import torch
 
     settings = pictures[0].settings
-    candidates = range(settings.get("num_candidates", 1))
-    generator = [torch.Generator().manual_seed(one.seed + candidate) for one in pictures for candidate in candidates]
+    generator = [torch.Generator().manual_seed(one.seed) for one in pictures]
     inputs = {name: [one.inputs[name] for one in pictures] for name in pictures[0].inputs}
     return pipe(**{**settings, **inputs}, generator=generator)
 

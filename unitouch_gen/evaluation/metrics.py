@@ -14,7 +14,6 @@ from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
-from torchmetrics.functional.classification import multiclass_calibration_error
 
 # Retrieval ------------------------------------------------------------------------------------------------------------
 
@@ -118,8 +117,3 @@ def share_right(predicted: Tensor, labels: Tensor, *, balanced: bool = False) ->
     """Share of classes (N,) that are the labels (N,), or its mean over the labels' classes, if balanced."""
     score = balanced_accuracy_score if balanced else accuracy_score
     return float(score(labels.cpu().numpy(), predicted.cpu().numpy()))
-
-
-def calibration_error(probabilities: Tensor, labels: Tensor) -> float:
-    """Mean gap between confidence and accuracy over 15 bins of confidence (Guo et al., 2017, Eq. 3)."""
-    return multiclass_calibration_error(probabilities, labels, probabilities.shape[1], n_bins=15).item()

@@ -1,8 +1,7 @@
 """Zero-shot classification: embeddings of any modality against the text of each class (Section 4.2 of the paper).
 
-Probabilities are a softmax over scores at a temperature fitted to labelled samples (Guo et al., 2017). Touches and
-texts were each bound to pictures, never to each other: with a bank of picture embeddings, a touch is named as the
-pictures near it are.
+Probabilities are a softmax over cosines at the temperature of training (Eq. 1), which is not calibrated: how sure they
+seem is not how often they are right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -122,30 +121,18 @@ class ZeroShotTouchClassifier:
 
         Args:
             features: (B, D), of any length.
-            modality: That they came from; its template and temperature are used.
+            modality: That they came from; its template is used.
             labels, template, top: See `__call__`.
             unknown: What `UniTouchModel.unknown_touches` says of each; nothing where it is empty.
         """
-        best = self.probabilities(features, modality, labels, template).topk(min(top or len(labels), len(labels)))
+        shares = (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
+        best = shares.topk(min(top or len(labels), len(labels)))
         rows = zip(best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True)
-        return [Named({labels[i]: p for i, p in zip(places, shares, strict=True)}, why) for places, shares, why in rows]
-
-    def probabilities(
-        self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
-    ) -> Tensor:
-        """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
-        config = self.model.config
-        temperature = config.temperatures.get(modality, config.temperature)
-        return (self.scores(features, modality, labels, template) / temperature).softmax(dim=1)
+        return [Named({labels[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]
 
     def scores(
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
     ) -> Tensor:
-        """Cosines of embeddings with the labels in words, (B, labels)."""
+        """Cosines of embeddings with the labels in words, (B, labels); see `name` for the arguments."""
         texts = [(template or PROMPTS[modality]).format(label) for label in labels]
         return F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the probabilities of touches are calibrated: for labels like those that this was fitted to."""
-        return "touch" in self.model.config.temperatures

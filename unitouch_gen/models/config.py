@@ -126,7 +126,6 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
-        temperatures: Of zero-shot classification, fitted to validation samples, by modality.
         ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
             of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
@@ -151,12 +150,12 @@ class UniTouchConfig(PreTrainedConfig):
     prototype_size: int = 224
     sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
-    temperatures: dict[str, float] = field(default_factory=dict)
     ood_thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     embedding_norm: float | int = 1.0
 
     def __post_init__(self, **kwargs: Any) -> None:
-        for ignored in ("auto_map", "temperature_exponents", "logit_scales"):  # of the folder, and of earlier versions
+        # of the folder, and of earlier versions
+        for ignored in ("auto_map", "temperatures", "temperature_exponents", "logit_scales"):
             kwargs.pop(ignored, None)
         super().__post_init__(**kwargs)
         self.sensors = list(self.sensors)

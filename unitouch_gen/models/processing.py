@@ -92,14 +92,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
         side = self.image_size
         return torch.stack([centre_rectangle(image, side, side) for image in load_images(name, images)])
 
-    def sounds(
-        self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
-    ) -> Tensor:
+    def sounds(self, sounds: AudioInput, *, name: str = "audio", audible: bool = False) -> Tensor:
         """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`; see `load_sounds`.
 
-        `sampling_rate` is that of arrays that come without one, Hz; with `audible`, silence is refused.
+        With `audible`, silence is refused.
         """
-        loaded = load_sounds(name, sounds, sampling_rate)
+        loaded = load_sounds(name, sounds)
         for number, sound in enumerate(loaded):
             if audible and np.ptp(sound.samples) <= 2.0**-15:  # one bit of 16
                 where = name if len(loaded) == 1 else f"{name}[{number}]"

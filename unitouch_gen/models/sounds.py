@@ -32,28 +32,27 @@ class Sound:
     rate: int
 
 
-def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None) -> list[Sound]:
+def load_sounds(name: str, sounds: AudioInput) -> list[Sound]:
     """Mono sounds.
 
-    Accepts a path (wav, flac, ogg, mp3), a pair (array, rate), an array or tensor (T,) or (channels, T) with
-    `sampling_rate` beside it, and lists of them.
+    Accepts a path (wav, flac, ogg, mp3), a pair of an array or tensor (T,) or (channels, T) and its rate in Hz, and
+    lists of them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no sound, samples are missing, not finite or of a wrong shape,
             or no rate came. The message names the argument, `name`, and the item.
     """
     if not isinstance(sounds, list):
-        return [_load(name, sounds, sampling_rate)]
+        return [_load(name, sounds)]
     if not sounds:
         raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
-    return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
+    return [_load(f"{name}[{i}]", sound) for i, sound in enumerate(sounds)]
 
 
-def _load(name: str, sound: Any, rate: int | None) -> Sound:
+def _load(name: str, sound: Any) -> Sound:
     if isinstance(sound, str | os.PathLike):
-        sound, rate = _read(name, sound)
-    elif isinstance(sound, tuple) and len(sound) == 2:
-        sound, rate = sound
+        sound = _read(name, sound)
+    sound, rate = sound if isinstance(sound, tuple) and len(sound) == 2 else (sound, None)
     samples = sound
     if isinstance(sound, Tensor):
         samples = (sound.float() if sound.is_floating_point() else sound).detach().cpu().numpy()

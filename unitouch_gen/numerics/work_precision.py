@@ -180,15 +180,6 @@ def amount(row: Row) -> str:
     return f"tolerance {row['tolerance']:g}" if row["steps"] is None else f"{row['steps']} steps"
 
 
-def machine() -> str:
-    """What timings depend on, in words."""
-    known = Path("/proc/cpuinfo")
-    lines = known.read_text(encoding="utf-8").splitlines() if known.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    threads = f"{torch.get_num_threads()} threads, torch {torch.__version__}"
-    return f"{(names or [platform.machine()])[0]}, {threads}"
-
-
 # Chart ----------------------------------------------------------------------------------------------------------------
 
 
@@ -235,7 +226,7 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
     """Writes `results.json` and `chart.png`."""
     values = {"target": target.name, "guidance_scale": target.guidance.scale, "own_error": target.own_error,
-              "machine": machine(), "rows": list(rows)}  # fmt: skip
+              "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "rows": list(rows)}  # fmt: skip
     picture = io.BytesIO()
     draw_chart(target, rows).savefig(picture, format="png", dpi=160, facecolor="white")
     contents: dict[str, str | bytes] = {"results.json": json.dumps(values, indent=1), "chart.png": picture.getvalue()}
