@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,13 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
     "touch_classifier": (*ALONE, *RESNET),
+    "language_model": ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24"),
+    "touch_llm": ("model.intermediate_size=24",),
 }
+
+
+FROZEN = defaultdict(set, touch_llm={"language_model"})
+"""Parts of an objective that are not trained."""
 
 
 def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None:
@@ -86,7 +93,7 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         first, last = (load_file(folder / "model.safetensors") for folder in checkpoints_in(runs / name))
         still = {key for key, value in last.items() if torch.equal(value, first[key])}
         if name not in ("unclip", "touch_ldm"):  # group norms of single pixels learn nothing
-            assert not {key for key in still if not key.endswith(("known", "prototypes"))}
+            assert {key.split(".")[0] for key in still if not key.endswith(("known", "prototypes"))} <= FROZEN[name]
     for name, modality in (("picture_classifier", "image"), ("touch_classifier", "touch")):
         classifier = ContactClassifier.from_pretrained(runs / name / "model")
         assert classifier.attributes == SHOWN[modality]
@@ -139,6 +146,7 @@ def test_a_family_becomes_pictures_and_touches(family: Path) -> None:
     for drawn in ({"sensor": "digit"}, {"background": touch[0]}):
         made = pipe(text="rough brick", num_inference_steps=2, output_type="np", **drawn).images
         assert made.shape == (1, 32, 32, 3) and np.isfinite(made).all()
+    assert len(tiny("touch-to-text", family=family)(touch, "How does it feel?", max_new_tokens=4).texts) == 1
 
 
 def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path, runs: Path) -> None:
@@ -146,8 +154,9 @@ def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path,
     for path in family.rglob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             kinds[path] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
-    # the joint space; of pictures and of touches autoencoder, UNet and classifier; normaliser, bank, and untouched gels
-    assert len(kinds) == 10 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
+    # the joint space; of pictures and of touches autoencoder, UNet and classifier; normaliser, bank, and
+    # untouched gels; language model and bridge
+    assert len(kinds) == 12 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
     for part in ("image_text", "audio", "touch"):
         state = load_file(runs / part / "model" / "model.safetensors")
         stored = load_file(family / "joint" / "model.safetensors")

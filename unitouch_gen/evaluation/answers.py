@@ -48,9 +48,9 @@ def caption_table(
 ) -> dict[str, Figures]:
     """Shares of answers that are right, of `each` contacts of every material of the split "test", by row.
 
-    Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of the material and
-    of the grain, where there is one, it is the accuracy; of the place, the hardness and a grasp it is balanced.
-    Attributes of captions are right if any true caption has them; ROUGE-L is that to the nearest of these.
+    Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of hardness and
+    grasps accuracy is balanced over what is true; of grains it is of such as there are. Attributes of captions are
+    right if any true caption has them; ROUGE-L is that to the nearest of these.
 
     Args:
         pipe: A `TouchToTextPipeline`.
@@ -101,7 +101,7 @@ def measured(
         ]
         right = {true: [true == said for other, said in pairs if other == true] for true, _ in pairs if true}
         shares = [sum(found) / len(found) for found in right.values()]
-        balanced = topic not in ("material", "grain")
+        balanced = topic in ("feel", "grasp")
         count = sum(map(len, right.values()))
         figures[COLUMNS[topic]] = sum(shares) / len(shares) if balanced else sum(map(sum, right.values())) / count
     if "caption" in answers:
