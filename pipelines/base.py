@@ -505,8 +505,10 @@ def check_filled(folder: Path, network: Any) -> None:
             for name in file.keys():  # noqa: SIM118 - not a dict
                 if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
                     sizes[name] = math.prod(file.get_slice(name).get_shape())
-    held, wanted = sum(sizes.values()), sum([tensor.numel() for tensor in network.state_dict().values()])
-    if held < wanted or any(tensor.is_meta for tensor in network.state_dict().values()):
+    tensors = [*network.state_dict().values()]
+    # Tied weights are stored once.
+    held, wanted = sum(sizes.values()), sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
+    if held < wanted or any(tensor.is_meta for tensor in tensors):
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
     from unitouch_gen.examples import example
     from unitouch_gen.models import (
+        LanguageBridge,
         SensorBank,
         StemmedCLIPVisionModel,
         UniTouchConfig,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         TactileStylizationPipeline,
         TouchToImagePipeline,
         TouchToTextPipeline,
+        TouchToTextPipelineOutput,
         UniTouchPipelineOutput,
         XToTouchPipeline,
     )
@@ -34,15 +36,23 @@ __version__ = "0.1.0"
 _HOMES = {
     "errors": ("InvalidInputError", "InvalidTypeError", "NonFiniteError"),
     "examples": ("example",),
-    "models": ("SensorBank", "StemmedCLIPVisionModel", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor"),
+    "models": (
+        "LanguageBridge",
+        "SensorBank",
+        "StemmedCLIPVisionModel",
+        "UniTouchConfig",
+        "UniTouchModel",
+        "UniTouchProcessor",
+    ),
     "pipelines.tiny": ("tiny",),
 }
 """Modules of names; the others are of `pipelines`."""
 
 __all__ = [
-    "InvalidInputError", "InvalidTypeError", "NonFiniteError", "SensorBank", "StemmedCLIPVisionModel",
-    "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline", "UniTouchConfig", "UniTouchModel",
-    "UniTouchPipelineOutput", "UniTouchProcessor", "XToTouchPipeline", "example", "tiny",
+    "InvalidInputError", "InvalidTypeError", "LanguageBridge", "NonFiniteError", "SensorBank",
+    "StemmedCLIPVisionModel", "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline",
+    "TouchToTextPipelineOutput", "UniTouchConfig", "UniTouchModel", "UniTouchPipelineOutput", "UniTouchProcessor",
+    "XToTouchPipeline", "example", "tiny",
 ]  # fmt: skip
 
 

@@ -92,8 +92,8 @@ def over_seeds(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, d
     figures = {}
     for name in rows[0]:
         each = [row[name] for row in rows]
-        controls = ("value", "class_mean", "shuffled", "ceiling")
-        means = {key: statistics.mean(one[key] for one in each) if key in each[0] else None for key in controls}
+        means: dict[str, float | None] = dict.fromkeys(("value", "class_mean", "shuffled", "ceiling"))
+        means |= {key: statistics.mean(one[key] for one in each) for key in each[0]}
         values = [one["value"] for one in each]
         figures[name] = {**means, "spread": max(values) - min(values)}
     return figures

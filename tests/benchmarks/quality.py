@@ -33,6 +33,7 @@ from tests.benchmarks.joint_space import JointSpace, agreed, found_within, held_
 from tests.benchmarks.measuring import Figures, attribute_agreement, cross_predicted, over_seeds, quiet
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.evaluation.answers import caption_table
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
 from unitouch_gen.evaluation.controls import (
     class_means,
@@ -203,6 +204,18 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     return figures
 
 
+ANSWERED = {"value": "touch", "usual": "most frequent answer", "shuffled": "shuffled touches", "ceiling": "picture"}
+"""Columns of answers, and rows of `caption_table`."""
+
+
+def answer_rows(pipe: Any, joint: JointSpace, contacts: Contacts, each: int) -> Figures:
+    """Answers about touches that are put in zero-shot; the reference is asked about the pictures."""
+    contacts.features = {name: joint.features(name, getattr(contacts, name)) for name in ("touch", "image")}
+    splits = {"train": contacts, "test": contacts}
+    rows = caption_table(pipe, splits, lambda texts: joint.features("text", texts), each)
+    return {f"answer: {name}": {key: rows[row][name] for key, row in ANSWERED.items()} for name in rows["touch"]}
+
+
 def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, seed: int) -> Figures:
     """Whole photos restyled by touches, by default: "layout" is the correlation of brightness with the photo's, and
     "colours" that of all three channels, blurred by 6 of 128 pixels; "detail" the median energy of what has changed and
@@ -305,6 +318,8 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
             found |= restyled_rows(pipes["stylization"], judges["image"], contacts, *drawn)
         if "x-to-touch" in pipes and given.touched_by:
             found |= x_to_touch_rows(pipes["x-to-touch"], judges["touch"], contacts, *drawn)
+        if "touch-to-text" in pipes:
+            found |= answer_rows(pipes["touch-to-text"], joint, contacts, given.each)
         if given.photos and seed == seeds[0]:
             figures["photos"] = photo_figures(pipes, contacts, given.photos, seed)
         rows.append(found)
@@ -318,7 +333,7 @@ def quality_figures(recordings: Path | None, photos: Path | None, seeds: int) ->
     named = ["--touched-by", "gelsight"]
     for option, folder in {"--recordings": recordings, "--photos": photos}.items():
         named += [] if folder is None else [option, str(folder)]
-    fewer = ["--pipelines", "touch-to-image"]
+    fewer = ["--pipelines", "touch-to-image", "touch-to-text"]
     with TemporaryDirectory() as scratch:
         figures = measure(arguments([*words, *named]), Path(scratch))
         figures["drawn"] = measure(arguments([*words, *fewer]), Path(scratch))["rows"]

@@ -29,13 +29,15 @@ def percent(share: float) -> str:
 
 # Quality --------------------------------------------------------------------------------------------------------------
 
-SHARES = ("material", "of the touch", "of the photo", "within 20")
+ANSWERS = ("contact place", "grain", "hard or soft", "grasp", "caption's attributes")
+SHARES = ("material", "of the touch", "of the photo", "within 20", *ANSWERS)
 """Ends of the names of figures that are shares; others are correlations and distances."""
 
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
 
 
-TOLD = ("material", "within material", "within 20", "Frechet distance", "layout kept", "of the touch", "of the photo")
+TOLD = ("material", "within material", "within 20", "Frechet distance", "layout kept", "of the touch", "of the photo",
+        *ANSWERS, "ROUGE-L")  # fmt: skip
 """Ends of the names of figures that the pages show; `family.json` has them all."""
 
 
@@ -71,6 +73,9 @@ SUMMARY = {
     "restyled photo: material of the touch": "**photo restyled by a touch**: named as the touch's material",
     "restyled photo: relief of the touch": "... relief of the touch (correlation)",
     "restyled photo: layout kept": "... layout of the photo (correlation)",
+    "answer: material": "**question about a touch**: the material is named",
+    "answer: hard or soft": "... hard or soft (balanced)",
+    "answer: contact place": "... where the contact is",
 }
 """What README.md shows, in its words."""
 
@@ -181,12 +186,25 @@ def cost_table(figures: Figures) -> str:
     return table(["error", *heads], rows, note)
 
 
+def answers_table(figures: Figures) -> str:
+    """Answers, beside those to other contacts' touches, about the pictures, and the most frequent ones."""
+    rows = []
+    for name, row in figures["quality"]["rows"].items():
+        if name.startswith("answer: "):
+            value = f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})"
+            controls = [_shown(name, row[key]) for key in ("ceiling", "shuffled", "usual")]
+            rows.append([name.removeprefix("answer: "), value, *controls])
+    head = ["right in answers", "touch (spread)", "picture", "another's touch", "most frequent answer"]
+    return table(head, rows)
+
+
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,
     "figures": main_table,
     "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "word to", "sound to"),
     "style figures": lambda figures: quality_table(figures, "photo as it was", "restyled"),
     "real figures": real_table,
+    "answers": answers_table,
     "cost at error": cost_table,
 }
 """What stands between two comments of that name, on one page."""

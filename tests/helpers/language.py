@@ -8,7 +8,7 @@ from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.language_model import train_language_tokenizer
 
 SIZES = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4,
-         "max_position_embeddings": 64}  # fmt: skip
+         "max_position_embeddings": 64, "tie_word_embeddings": True}  # fmt: skip
 
 
 def make_language_parts(**sizes: object) -> dict:
