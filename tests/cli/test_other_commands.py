@@ -85,7 +85,8 @@ def test_questions_are_answered_about_every_touch(command, refused, here, capsys
 
 def test_touch_llm_becomes_a_pipeline(command, tmp_path):
     tokenizer = make_language_parts()["tokenizer"]
-    touch_llm_files(tmp_path / "llama", tokenizer, legacy=False)
+    tokenizer.save_pretrained(tmp_path / "llama")
+    touch_llm_files(tmp_path / "llama", len(tokenizer), legacy=False)
     words = ("--bridge", tmp_path / "llama.pth", "--llama", tmp_path / "llama", "-o", tmp_path / "out")
     code, out, _ = command("convert", "touch-llm", *words)
     assert code == 0 and "CC-BY-NC-4.0" in out
