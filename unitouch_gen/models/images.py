@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -66,11 +67,14 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         _check_size(name, *image.size)  # before its pixels are decoded
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
+        if (deep := _deep_colours(image)) is not None:
+            return _by_range(subject, deep[..., :3], opacity=deep[..., 3:])
+        inverted = getattr(image, "tag_v2", {}).get(262) == 0  # TIFF's WhiteIsZero, which Pillow heeds up to 8 bits
         image = ImageOps.exif_transpose(image)
         if image.mode == "F":
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
-            return _by_range(subject, np.asarray(image))
+            return _by_range(subject, np.asarray(image), inverted=inverted)
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
@@ -85,15 +89,45 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         ) from error
 
 
-def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
-    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
+def _deep_colours(image: Any) -> np.ndarray | None:
+    """Colours of 16 bits, uint16 (H, W, 3), or (H, W, 4) with their opacity; `None` of other images.
+
+    Pillow keeps one byte of each. Told the other order of bytes, it keeps the other one.
+    """
+    tiles = [(tile, tile.args if isinstance(tile.args, tuple) else (tile.args,)) for tile in getattr(image, "tile", ())]
+    kinds = [args[0] for _, args in tiles]  # none once it is decoded
+    planes = {*kinds} == {"R", "G", "B"} and image.tag_v2[258][0] == 16  # which Pillow takes for 8 bits
+    if not planes and not (kinds and all(re.fullmatch("RGB[AX]?;16[BLN]", kind) for kind in kinds)):
+        return None
+    image.fp.seek(0)
+    content, found = image.fp.read(), []
+    for order in "BL":  # the first bytes, and the second ones
+        part: Any = Image.open(io.BytesIO(content))
+        part.seek(image.tell())
+        part.tile = [tile._replace(args=(f"{kind.split(';')[0]};16{order}", *args)) for tile, (kind, *args) in tiles]
+        found.append(np.asarray(ImageOps.exif_transpose(part)))
+    stored = image.tag_v2.prefix.decode()[0] if planes else kinds[0][-1]
+    return np.stack(found, axis=-1).view({"N": "=u2", "L": "<u2", "I": "<u2"}.get(stored, ">u2"))[..., 0]
+
+
+def _by_range(
+    subject: str, values: np.ndarray, *, opacity: np.ndarray | None = None, inverted: bool = False
+) -> np.ndarray:
+    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits.
+
+    Those with an opacity of 16 bits, (H, W, 1), are laid over white; of inverted ones 0 is white.
+    """
     low, high = int(values.min()), int(values.max())
     if low < 0 or high >= 1 << 16:
         raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
     bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
+    full = 2**bits - 1
     if bits < 16:
-        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {2**bits - 1}.", stacklevel=2)
-    return values.astype(np.uint8) if bits == 8 else (values / (2**bits - 1)).astype(np.float32)
+        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full}.", stacklevel=2)
+    if opacity is not None and opacity.size:
+        values = full - opacity / 65535 * (full - values)
+    values = full - values if inverted else values
+    return values.astype(np.uint8) if bits == 8 else (values / full).astype(np.float32)
 
 
 def _channels_first(name: str, array: np.ndarray) -> Tensor:
