@@ -8,8 +8,9 @@ import copy
 import math
 import os
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -62,19 +63,36 @@ SMALL_NETWORK = 20_000_000
 """Parameters below which threads of a CPU wait for each other longer than they work."""
 
 
+_small_calls, _counting = [0, 0], threading.Lock()  # how many run, and the number of threads to go back to
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Runs in one thread of the CPU; torch counts threads for all calls that run at the same time."""
+    with _counting:
+        if _small_calls[0] == 0:
+            _small_calls[1] = torch.get_num_threads()
+        _small_calls[0] += 1
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _counting:
+            _small_calls[0] -= 1
+            torch.set_num_threads(_small_calls[1])
+
+
 def runs_networks(method: Method) -> Method:
     """A method of a pipeline that runs networks: without gradients, and in one thread if its main network is small."""
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        threads = torch.get_num_threads()
-        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < SMALL_NETWORK
-        torch.set_num_threads(1 if small else threads)
-        try:
-            with torch.no_grad():
-                return method(self, *args, **kwargs)
-        finally:
-            torch.set_num_threads(threads)
+        weights = list(getattr(self, self._main_network).parameters())
+        if any(one.is_meta for one in weights):
+            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
+        small = sum(one.numel() for one in weights) < SMALL_NETWORK
+        with one_thread() if small else nullcontext(), torch.no_grad():
+            return method(self, *args, **kwargs)
 
     return run  # type: ignore[return-value]
 
@@ -99,7 +117,7 @@ class CallSettings:
     def __post_init__(self) -> None:
         check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
         check_kind("throw", self.throw, bool)
-        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs or {}, dict)
+        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs, dict, type(None)) or {}
         check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
 
 

@@ -162,7 +162,7 @@ def prepare_steps(
             f"`{second}` is {describe(given[second])}, but `{first}` was given, which sets the steps; leave one out."
         )
     if tolerance is None and max_evaluations is not None:
-        raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but needs a `tolerance`; leave it out.")
+        raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}, but needs a `tolerance`.")
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
     [(name, value)] = given.items()
@@ -234,7 +234,9 @@ def begun_within(scheduler: Any, share: float) -> Any:
 
 def check_falling(name: str, values: Any, high: float) -> list[float]:
     """Falling timesteps, or falling noise levels that end in 0."""
-    numbers = values.tolist() if hasattr(values, "tolist") else list(check_kind(name, values, list, tuple))
+    dense = not isinstance(values, Tensor) or (values.layout == torch.strided and not values.is_meta)
+    values = values.tolist() if dense and hasattr(values, "tolist") else values
+    numbers = list(check_kind(name, values, list, tuple))
     for place, number in enumerate(numbers):
         check_number(f"{name}[{place}]", number, 0.0, high)
     wrong_end = name == "sigmas" and (numbers[-1:] != [0.0] or len(numbers) < 2)

@@ -57,15 +57,19 @@ def test_cells_are_read_as_spreadsheets_write_them(here, run, files):
 
 
 def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, files):
-    """A video goes with the pictures."""
+    """A video goes with the pictures, and so does what is behind a link, once."""
     pytest.importorskip("av")
     for name in ("._a.png", ".DS_Store", "@eaDir/dark.png", ".ipynb_checkpoints/dark-checkpoint.png", "out/old.png"):
         (here / "in" / name).parent.mkdir(exist_ok=True)
         (here / "in" / name).write_bytes((here / "in" / "dark.png").read_bytes())
     recordings.write(here / "in" / "press.MP4", list(recordings.frames()))
+    (here / "far").mkdir()
+    (here / "in" / "dark.png").rename(here / "far" / "dark.png")
+    (here / "in" / "link").symlink_to(here / "far")
+    (here / "far" / "back").symlink_to(here / "in")
     code, _, err = run("in", "-o", "in/out")
     assert (code, err) == (0, "unitouch-gen: 4 other files in in are left out.\n")
-    assert files(here / "in" / "out") == ["bright.png", "dark.png", "manifest.jsonl", "old.png", "press.png"]
+    assert files(here / "in" / "out") == ["bright.png", "link/dark.png", "manifest.jsonl", "old.png", "press.png"]
 
 
 def test_lines_of_json_and_folders_for_x_to_touch(here, run, files):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from transformers import CLIPImageProcessorPil
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
@@ -80,10 +80,22 @@ def test_a_palette_is_looked_up_and_its_transparent_colour_is_white(processor, t
     palette = Image.new("P", (32, 32))
     palette.putpalette([0, 0, 0, 255, 0, 0, 51, 102, 153])
     palette.putdata([(x + y) % 3 for y in range(32) for x in range(32)])
-    palette.save(tmp_path / "palette.png", transparency=0)
+    for file in (files := [tmp_path / "palette.png", tmp_path / "palette.gif"]):
+        palette.save(file, transparency=0)
     table = np.array([[255] * 3, [255, 0, 0], [51, 102, 153]]) / 255
     expected = pixels_of(table[np.indices((32, 32)).sum(axis=0) % 3])
-    torch.testing.assert_close(processor.raw_images(tmp_path / "palette.png"), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(processor.raw_images(files), expected.expand(2, -1, -1, -1), rtol=0, atol=1e-6)
+
+
+def test_colours_are_those_of_the_profile(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Of one whose red and green are exchanged; sRGB's own and a broken one change nothing."""
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    renamed = srgb.replace("sRGB".encode("utf-16-be"), "mine".encode("utf-16-be"))
+    exchanged = renamed.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")
+    for profile, order in ((srgb, [0, 1, 2]), (renamed, [0, 1, 2]), (exchanged, [1, 0, 2]), (b"junk", [0, 1, 2])):
+        Image.fromarray(PICTURE).save(tmp_path / "a.png", icc_profile=profile)
+        found = processor.raw_images(tmp_path / "a.png")
+        torch.testing.assert_close(found, pixels_of(PICTURE[..., order] / 255), rtol=0, atol=1.01 / 255)
 
 
 def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: UniTouchProcessor, tmp_path) -> None:
@@ -99,7 +111,7 @@ def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: Un
 
 
 @pytest.mark.parametrize(
-    ("bits", "dtype"), [(8, np.int32), (8, np.uint16), (10, np.uint16), (12, np.uint16), (14, np.uint16)]
+    ("bits", "dtype"), [(8, "<i4"), (8, "<u2"), (10, "<u2"), (12, "<u2"), (12, ">u2"), (12, "<i2"), (14, "<u2")]
 )
 def test_full_scale_of_deep_greys_is_that_of_the_bits_they_use(processor: UniTouchProcessor, tmp_path, bits, dtype):
     """Of a file as of its array, and told; an ending is not needed."""

@@ -29,11 +29,12 @@ NUMBERS = {
     "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
     "num_images_per_prompt": ([0, 10**9], [1.5, True]),
     "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
+    "timesteps": ([], [torch.tensor(NAN), torch.eye(3).to_sparse()]), "sigmas": ([], [np.float64(1.0)]),
     "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3], []),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
     "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
-    "cross_attention_kwargs": ([{"scale": NAN}], [0.5, ["scale"], {"scale": "half"}]),
+    "cross_attention_kwargs": ([{"scale": NAN}], [0, ["scale"], {"scale": "half"}]),
 }  # fmt: skip
 TO_IMAGE = {
     "strength": ([-0.1, NAN, 1e7], ["1", False]), "noise_level": ([-1, 1000], [1.5, NAN, "0"]),

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_table
+from unitouch_gen.files import files_below, read_table
 from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in
 
 LOOKS_LIKE = ()
@@ -32,7 +32,7 @@ def read(folder: Path, patterns: Mapping[str, str] | None = None) -> Iterator[Re
     records = list(read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder))
     yield from records
     used = set(map(str, tables)).union(*(record.files for record in records))
-    others = {str(file) for file in folder.rglob("*") if file.is_file()} - used
+    others = set(map(str, files_below(folder))) - used
     unread = [] if tables else [image for image in images_in(folder, "**/*") if str(image) in others]
     if unread:
         names = few([image.relative_to(folder).as_posix() for image in unread])
@@ -78,9 +78,7 @@ def read_tree(folder: Path) -> Iterator[Record]:
             picture, background = (tree.get(name.with_suffix("")) for tree in (pictures, backgrounds))
             labels = {} if place in parts else {"material": place.name}
             split = None if parts == [root] else name.parts[0]
-            yield Record(
-                name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split
-            )
+            yield Record(name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split)
 
 
 def by_name(folder: Path) -> dict[Path, Frame]:

@@ -90,9 +90,11 @@ def batch(
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
     """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
+    from unitouch_gen.files import files_below
+
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
-    paths = [file for file in sorted(folder.rglob("*")) if output.resolve() not in file.resolve().parents]
+    paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
     files = files_in(folder, paths, columns)
     places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
     return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]

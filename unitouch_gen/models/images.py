@@ -4,13 +4,14 @@ import io
 import os
 import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
@@ -75,10 +76,11 @@ def _decoded(name: str, image: Any) -> np.ndarray:
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
             return _by_range(subject, np.asarray(image), inverted=inverted)
+        profile = image.info.get("icc_profile")
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        return np.array(image.convert("RGB"))
+        return np.array(_in_srgb(image, profile) if profile else image.convert("RGB"))
     except InvalidInputError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
@@ -89,13 +91,23 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         ) from error
 
 
+def _in_srgb(image: Image.Image, profile: bytes) -> Image.Image:
+    """An image in the colours of sRGB, in place of those of its profile."""
+    image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
+    with suppress(Exception):  # as viewers show it where a profile is broken, or of another mode
+        given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "srgb" not in ImageCms.getProfileDescription(given).lower():
+            image = ImageCms.profileToProfile(image, given, ImageCms.createProfile("sRGB"), outputMode="RGB") or image
+    return image.convert("RGB")
+
+
 def _deep_colours(image: Any) -> np.ndarray | None:
     """Colours of 16 bits, uint16 (H, W, 3), or (H, W, 4) with their opacity; `None` of other images.
 
     Pillow keeps one byte of each. Told the other order of bytes, it keeps the other one.
     """
     tiles = [(tile, tile.args if isinstance(tile.args, tuple) else (tile.args,)) for tile in getattr(image, "tile", ())]
-    kinds = [args[0] for _, args in tiles]  # none once it is decoded
+    kinds = [str(*args[:1]) for _, args in tiles]  # none once it is decoded
     planes = {*kinds} == {"R", "G", "B"} and image.tag_v2[258][0] == 16  # which Pillow takes for 8 bits
     if not planes and not (kinds and all(re.fullmatch("RGB[AX]?;16[BLN]", kind) for kind in kinds)):
         return None
@@ -138,7 +150,7 @@ def _channels_first(name: str, array: np.ndarray) -> Tensor:
     if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
         wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
         raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
-    if array.dtype == np.uint16 and array.size and array.max() > 255:
+    if array.dtype.kind in "ui" and array.dtype.itemsize == 2 and array.size and array.max() > 255:
         pixels = _by_range(f"`{name}`", pixels)
     elif array.dtype != np.uint8:
         pixels = pixels.astype(np.float64 if array.dtype.kind in "fb" else np.int64)
