@@ -45,7 +45,7 @@ test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
 test-all: $(VENV)/.installed-dev  ## run all the tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
 
-soak: $(VENV)/.installed-dev  ## try threads, kills, full disks and bad inputs (make soak ARGS="--seed 1")
+soak: $(VENV)/.installed-dev  ## try threads, kills, full disks and bad inputs (make soak ARGS=SEED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.soak $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports follow the arrows

@@ -8,9 +8,8 @@ import copy
 import math
 import os
 import tempfile
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -63,23 +62,7 @@ SMALL_NETWORK = 20_000_000
 """Parameters below which threads of a CPU wait for each other longer than they work."""
 
 
-_small_calls, _counting = [0, 0], threading.Lock()  # how many run, and the number of threads to go back to
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Runs in one thread of the CPU; torch counts threads for all calls that run at the same time."""
-    with _counting:
-        if _small_calls[0] == 0:
-            _small_calls[1] = torch.get_num_threads()
-        _small_calls[0] += 1
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        with _counting:
-            _small_calls[0] -= 1
-            torch.set_num_threads(_small_calls[1])
+_threads: list[int] = []  # of torch before the first of the calls that run in one at this time, for each of them
 
 
 def runs_networks(method: Method) -> Method:
@@ -90,9 +73,16 @@ def runs_networks(method: Method) -> Method:
         weights = list(getattr(self, self._main_network).parameters())
         if any(one.is_meta for one in weights):
             raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
-        small = sum(one.numel() for one in weights) < SMALL_NETWORK
-        with one_thread() if small else nullcontext(), torch.no_grad():
-            return method(self, *args, **kwargs)
+        if sum(one.numel() for one in weights) >= SMALL_NETWORK:
+            return torch.no_grad()(method)(self, *args, **kwargs)
+        _threads.append([*_threads, torch.get_num_threads()][0])
+        torch.set_num_threads(1)
+        try:
+            with torch.no_grad():
+                return method(self, *args, **kwargs)
+        finally:
+            torch.set_num_threads(_threads[0])
+            _threads.pop()
 
     return run  # type: ignore[return-value]
 

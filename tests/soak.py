@@ -1,13 +1,12 @@
 """What a package meets in other hands: threads, kills, full disks, and bad inputs that are drawn from a seed.
 
-    python -m tests.soak --seed 0
+    OMP_NUM_THREADS=1 python -m tests.soak [SEED]
 
 Ends with 1 unless nothing was lost (half written, or another thread's picture), silent (a bad input made a picture: of
-numbers that are not finite, of half an image, or as if an argument had not been there) or raw (an exception that is not
-of the package's own; of a command, more than a line, or an exit code that is none of its own).
+numbers that are not finite, of half an image, or as if an argument had not been there) or raw (no error of the
+package's own; of a command, more than a line or another exit code).
 """
 
-import argparse
 import inspect
 import io
 import json
@@ -16,7 +15,6 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -31,7 +29,7 @@ import unitouch_gen
 from tests.helpers import recordings
 from tests.helpers.calls import quiet, seeded
 from tests.helpers.components import make_pipelines
-from tests.helpers.damage import ODD, odd_array, whole_files
+from tests.helpers.damage import ODD, WORDS, odd_array, whole_files
 from tests.helpers.processes import Child, command, finished, save_numbered
 from unitouch_gen import cli, example
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, first_line
@@ -44,8 +42,6 @@ def note(kind: str, what: str) -> None:
     FOUND[kind].append(what)
     print(f"{kind}: {what}", flush=True)
 
-
-# Threads --------------------------------------------------------------------------------------------------------------
 
 CALLS: list[tuple[str, dict[str, Any]]] = [
     ("touch-to-image", {"touch": example("digit_wood"), "prompt": "a photo of wood", "guidance_scale": 3.0}),
@@ -68,9 +64,6 @@ def share_pipelines(threads: int, calls: int) -> None:
         for number, made in zip(order, pool.map(lambda number: picture(shared, number), order), strict=True):
             if abs(made - expected[number]).max() > 1e-5:
                 note("lost", f"call {number} beside other threads")
-
-
-# Kills and full disks -------------------------------------------------------------------------------------------------
 
 
 def seen(folder: Path, pattern: str = "**/*") -> dict[str, bytes]:
@@ -101,12 +94,11 @@ def kill_saves(here: Path, kills: int) -> None:
         how = killed(save_numbered, str(folder), 2 - count % 2, folder=here, **limits)
         if seen(folder) not in whole:
             note("lost", f"a save, {how}")
-    for longest in (0, 60_000):  # bytes of a file that fit on the disk
-        before, child = seen(folder), Child(save_numbered, str(folder), 2, folder=here, longest=longest)
-        if child.wait() != 1 or "`save_directory` cannot be written to" not in child.err.splitlines()[-1]:
-            note("raw", f"a save to a full disk: {child.err[-300:]}")
-        if seen(folder) != before:
-            note("lost", f"a save to a disk that was full at {longest}")
+    before, child = seen(folder), Child(save_numbered, str(folder), 2, folder=here, longest=DRAW.choice([0, 60_000]))
+    if child.wait() != 1 or "`save_directory` cannot be written to" not in child.err.splitlines()[-1]:
+        note("raw", f"a save to a full disk: {child.err[-300:]}")
+    if seen(folder) != before:
+        note("lost", "a save to a full disk")
 
 
 def kill_batches(here: Path, model: str, kills: int) -> None:
@@ -133,10 +125,7 @@ def kill_batches(here: Path, model: str, kills: int) -> None:
             note("lost", f"a picture of {full[0]} to a full disk")
 
 
-# Bad inputs -----------------------------------------------------------------------------------------------------------
-
-
-def tried(what: str, call: Callable[[], Any]) -> Any:
+def tried(what: str, call: Any) -> Any:
     """What a call makes, or `None` where it refuses its input as the package does."""
     try:
         with warnings.catch_warnings():
@@ -161,20 +150,16 @@ def read_damaged_files(here: Path, pipes: dict[str, Any], count: int) -> None:
             content[place] ^= 1 << DRAW.randrange(8)
         cut = DRAW.random() < 0.3
         file.write_bytes(whole[name][: places[0]] if cut else content)
-        calls = [("touch-to-image", {"touch": file}), ("stylize", {"image": file, "touch": torch.rand(3, 32, 32)})]
-        kind, given = ("x-to-touch", {"audio": file}) if name.startswith("sound") else DRAW.choice(calls)
+        kind, given = ("x-to-touch", "audio") if name.startswith("sound") else ("touch-to-image", "touch")
         what = f"{name} {'cut' if cut else 'turned'} at {places}"
-        made = tried(what, lambda: pipes[kind](**given, output_type="latent").images)  # noqa: B023
+        made = tried(what, lambda: pipes[kind](**{given: file}, output_type="latent").images)  # noqa: B023
         half = cut and name.startswith("still") and 2 * places[0] < len(content)
         if made is not None and (half or not made.isfinite().all()):
             note("silent", what)
 
 
 ARRAYS = "touch image audio background latents touch_embeds condition_embeds prompt_embeds negative_prompt_embeds"
-FREE = (
-    "throw bridge output_type generator cross_attention_kwargs callback_on_step_end callback_on_step_end_tensor_inputs"
-)
-"""Arguments that need not change the picture."""
+FREE = ("throw", "bridge", "output_type", "generator", "cross_attention", "callback")  # need not change the picture
 
 
 def pass_odd_arguments(pipes: dict[str, Any], count: int) -> None:
@@ -192,9 +177,9 @@ def pass_odd_arguments(pipes: dict[str, Any], count: int) -> None:
             what = f"{kind} {name}={str(value)[:70]!r}"
             output = tried(what, lambda: pipes[kind](**given))  # noqa: B023
             if output is not None and isinstance(output.images, torch.Tensor):
-                left_out = name in FREE.split() or (isinstance(value, str | int) and not str(value).strip("0 "))
+                left_out = name.startswith(FREE) or (isinstance(value, str | int) and not str(value).strip("0 "))
                 same = output.images.shape == expected.shape and torch.equal(output.images, expected)
-                broken = isinstance(value, np.ndarray | torch.Tensor) and not torch.as_tensor(value).isfinite().all()
+                broken = isinstance(value, np.ndarray | torch.Tensor) and not np.isfinite(np.asarray(value)).all()
                 if broken or (same and not left_out) or not output.images.isfinite().all():
                     note("silent", what)
 
@@ -204,8 +189,6 @@ COMMANDS = {
     "batch": "table.csv -o out", "classify": "in/a.png --labels wood,glass", "adapt": "in --sensor mine",
     "convert unitouch": "--touch in/a.png -o out", "data check": "in", "stability": "--list",
 }  # fmt: skip
-WORDS = [*"-*[~0= ", "", "nan", "-1", "1e999", "9" * 50, "junk", "a=b", "{}", "gone.png", "in", "in/a.png", "table.csv",
-         "/proc/self/x", "/dev/null", "example:junk", "cuda:99", "a" * 5000, "\udcff"]  # fmt: skip
 
 
 class Ran(BaseException):
@@ -250,20 +233,17 @@ def soak(here: Path) -> None:
     for folder in ("in", "saves", "damaged"):
         (here / folder).mkdir()
     Image.fromarray(next(recordings.frames())).save(here / "in" / "a.png")
-    share_pipelines(threads=6, calls=6)
-    kill_saves(here / "saves", kills=12)
-    kill_batches(here, models["touch-to-image"], kills=12)
-    read_damaged_files(here / "damaged", pipes, count=300)
-    pass_odd_arguments(pipes, count=250)
+    share_pipelines(threads=6, calls=4)
+    kill_saves(here / "saves", kills=9)
+    kill_batches(here, models["touch-to-image"], kills=9)
+    read_damaged_files(here / "damaged", pipes, count=200)
+    pass_odd_arguments(pipes, count=150)
     run_odd_commands(models, count=150)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    DRAW.seed(parser.parse_args().seed)
+    DRAW.seed(int(sys.argv[1]) if len(sys.argv) > 1 else 0)
     torch.manual_seed(0)
-    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as place, chdir(place):
         soak(Path(place))
     print(", ".join(f"{len(items)} {kind}" for kind, items in FOUND.items()))

@@ -95,6 +95,10 @@ ODD: list[Any] = [
 ]  # fmt: skip
 """Arguments that hardly any parameter takes."""
 
+WORDS = [*"-*[~0= ", "", "nan", "-1", "1e999", "9" * 50, "junk", "a=b", "{}", "gone.png", "in", "in/a.png", "table.csv",
+         "/proc/self/x", "/dev/null", "example:junk", "cuda:99", "a" * 5000, "\udcff"]  # fmt: skip
+"""The same on a command line."""
+
 
 def odd_array(draw: random.Random) -> Any:
     """An array or tensor of any shape, dtype and values."""

@@ -59,6 +59,8 @@ def batch(
     pictures = pictures_of([shared | checked(row, columns, folder) for row in rows], output)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
+    if manifest.exists() and not (lines := manifest.read_bytes()).endswith(b"\n"):  # of a disk that was full
+        manifest.write_bytes(lines[: lines.rfind(b"\n") + 1])
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
     calls = calls_of([picture for picture in pictures if not picture.file.exists()], batch_size)

@@ -69,7 +69,7 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
         if (deep := _deep_colours(image)) is not None:
-            return _by_range(subject, deep[..., :3], opacity=deep[..., 3:])
+            return _by_range(subject, deep[..., :3], deep[..., 3:])
         inverted = getattr(image, "tag_v2", {}).get(262) == 0  # TIFF's WhiteIsZero, which Pillow heeds up to 8 bits
         image = ImageOps.exif_transpose(image)
         if image.mode == "F":
@@ -122,13 +122,8 @@ def _deep_colours(image: Any) -> np.ndarray | None:
     return np.stack(found, axis=-1).view({"N": "=u2", "L": "<u2", "I": "<u2"}.get(stored, ">u2"))[..., 0]
 
 
-def _by_range(
-    subject: str, values: np.ndarray, *, opacity: np.ndarray | None = None, inverted: bool = False
-) -> np.ndarray:
-    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits.
-
-    Those with an opacity of 16 bits, (H, W, 1), are laid over white; of inverted ones 0 is white.
-    """
+def _by_range(subject: str, values: np.ndarray, opacity: Any = None, inverted: bool = False) -> np.ndarray:
+    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
     low, high = int(values.min()), int(values.max())
     if low < 0 or high >= 1 << 16:
         raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
@@ -136,7 +131,7 @@ def _by_range(
     full = 2**bits - 1
     if bits < 16:
         warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full}.", stacklevel=2)
-    if opacity is not None and opacity.size:
+    if opacity is not None and opacity.size:  # of 16 bits, (H, W, 1)
         values = full - opacity / 65535 * (full - values)
     values = full - values if inverted else values
     return values.astype(np.uint8) if bits == 8 else (values / full).astype(np.float32)
