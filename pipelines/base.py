@@ -62,7 +62,7 @@ SMALL_NETWORK = 20_000_000
 """Parameters below which threads of a CPU wait for each other longer than they work."""
 
 
-_threads: list[int] = []  # of torch before the first of the calls that run in one at this time, for each of them
+_threads: list[int] = []  # how many torch had before the first of the calls that run now, for each of these
 
 
 def runs_networks(method: Method) -> Method:
@@ -73,10 +73,9 @@ def runs_networks(method: Method) -> Method:
         weights = list(getattr(self, self._main_network).parameters())
         if any(one.is_meta for one in weights):
             raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
-        if sum(one.numel() for one in weights) >= SMALL_NETWORK:
-            return torch.no_grad()(method)(self, *args, **kwargs)
+        small = sum(one.numel() for one in weights) < SMALL_NETWORK
         _threads.append([*_threads, torch.get_num_threads()][0])
-        torch.set_num_threads(1)
+        torch.set_num_threads(1 if small else _threads[0])
         try:
             with torch.no_grad():
                 return method(self, *args, **kwargs)

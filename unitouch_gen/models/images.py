@@ -76,11 +76,15 @@ def _decoded(name: str, image: Any) -> np.ndarray:
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
             return _by_range(subject, np.asarray(image), inverted=inverted)
-        profile = image.info.get("icc_profile")
+        profile = image.info.get("icc_profile") or b""
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        return np.array(_in_srgb(image, profile) if profile else image.convert("RGB"))
+        image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
+        with suppress(ImageCms.PyCMSError, OSError):  # as viewers show it where a profile is broken, or of another mode
+            given, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+            image = ImageCms.profileToProfile(image, given, srgb, outputMode="RGB") if profile else image
+        return np.array(image.convert("RGB"))
     except InvalidInputError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
@@ -89,16 +93,6 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         raise InvalidInputError(
             f"{subject} cannot be read as an image ({reason}); pass a whole PNG, JPEG or other image file."
         ) from error
-
-
-def _in_srgb(image: Image.Image, profile: bytes) -> Image.Image:
-    """An image in the colours of sRGB, in place of those of its profile."""
-    image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
-    with suppress(Exception):  # as viewers show it where a profile is broken, or of another mode
-        given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "srgb" not in ImageCms.getProfileDescription(given).lower():
-            image = ImageCms.profileToProfile(image, given, ImageCms.createProfile("sRGB"), outputMode="RGB") or image
-    return image.convert("RGB")
 
 
 def _deep_colours(image: Any) -> np.ndarray | None:

@@ -68,8 +68,8 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
     full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
     if full_scale > 1 << 15 and (samples & 255).any():  # none of fewer bits that stand at the top
         peak = max(int(samples.max()), -int(samples.min()))
-        full_scale = 2.0 ** (15 if peak <= 1 << 15 else 23 if peak <= 1 << 23 else 31)
-        if 8 * samples.dtype.itemsize > 32 or full_scale < 1 << 31:
+        usual, full_scale = full_scale, 2.0 ** (15 if peak <= 1 << 15 else 23 if peak <= 1 << 23 else 31)
+        if full_scale < usual:
             warnings.warn(f"`{name}` holds up to {peak}; full scale is taken to be {full_scale:.0f}.", stacklevel=2)
     with np.errstate(all="ignore"):
         channels = np.atleast_2d(samples)
