@@ -26,8 +26,8 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
     Accepts a path (image or .npy), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
     a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
-    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images with
-    transparency are laid over white, as most viewers show them.
+    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images are in
+    the colours of their profile, and laid over white where they are transparent, as most viewers show them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no whole image, one is too small or too large, an array has a
