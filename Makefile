@@ -32,7 +32,7 @@ weights: export MALLOC_TRIM_THRESHOLD_ := 4000000000
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:  # stages share a cache
-.PHONY: help venv demo test test-all lint docs bench weights clean
+.PHONY: help venv demo test test-all soak lint docs bench weights clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -47,6 +47,9 @@ test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
 
 test-all: $(VENV)/.installed-dev  ## run all the tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
+
+soak: $(VENV)/.installed-dev  ## try threads, kills, full disks and bad inputs (make soak ARGS=SEED)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.soak $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports follow the arrows
 	$(BIN)/ruff check .

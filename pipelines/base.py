@@ -62,19 +62,26 @@ SMALL_NETWORK = 20_000_000
 """Parameters below which threads of a CPU wait for each other longer than they work."""
 
 
+_threads: list[int] = []  # how many torch had before the first of the calls that run now, for each of these
+
+
 def runs_networks(method: Method) -> Method:
     """A method of a pipeline that runs networks: without gradients, and in one thread if its main network is small."""
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        threads = torch.get_num_threads()
-        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < SMALL_NETWORK
-        torch.set_num_threads(1 if small else threads)
+        weights = list(getattr(self, self._main_network).parameters())
+        if any(one.is_meta for one in weights):
+            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
+        small = sum(one.numel() for one in weights) < SMALL_NETWORK
+        _threads.append([*_threads, torch.get_num_threads()][0])
+        torch.set_num_threads(1 if small else _threads[0])
         try:
             with torch.no_grad():
                 return method(self, *args, **kwargs)
         finally:
-            torch.set_num_threads(threads)
+            torch.set_num_threads(_threads[0])
+            _threads.pop()
 
     return run  # type: ignore[return-value]
 
@@ -99,7 +106,7 @@ class CallSettings:
     def __post_init__(self) -> None:
         check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
         check_kind("throw", self.throw, bool)
-        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs or {}, dict)
+        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs, dict, type(None)) or {}
         check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
 
 

@@ -148,7 +148,7 @@ def learn(
         log_fn(f"{pictured} of {len(data)} touches have a picture, so no pictures are used; give one to each")
 
     def pixels(column: str) -> np.ndarray:
-        rows = tqdm(data.records, desc=f"{data.name}: {column}", mininterval=5.0)
+        rows = tqdm(data.records, desc=f"{data.name}: {column}", mininterval=5.0, disable=None)
         return np.stack([square(getattr(record, column), processor.image_size) for record in rows])
 
     return adapt(joint, name, pixels("touch"), pixels("picture") if pictured == len(data) else None, config)

@@ -60,7 +60,7 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
         if code == 130:  # interrupted
             say("stopped; what is written is whole.")
         return code
-    except (*usage, InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+    except (*usage, OSError, InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
         message = error.format_message() if isinstance(error, usage) else str(error)
         if message:  # empty where the help has been shown instead
             say(message)

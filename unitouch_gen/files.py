@@ -174,6 +174,15 @@ def natural(path: str | Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
+def files_below(folder: Path, above: frozenset[str] = frozenset()) -> list[Path]:
+    """The files in a folder and those below, in natural order; also behind links, unless they lead back."""
+    above |= {os.path.realpath(folder)}
+    _, folders, names = next(os.walk(folder), ("", [], []))  # nothing of a folder that may not be read
+    inner = [path for name in sorted(folders, key=natural) if os.path.realpath(path := folder / name) not in above]
+    files = [file for name in sorted(names, key=natural) if os.path.isfile(file := folder / name)]
+    return [*files, *(file for path in inner for file in files_below(path, above))]
+
+
 def is_hidden(path: Path) -> bool:
     """Whether a path in a folder of the user's is what systems and programs leave there for themselves."""
     return any(part.startswith((".", "~$")) or part in ("@eaDir", "__MACOSX", "$RECYCLE.BIN") for part in path.parts)
@@ -200,6 +209,8 @@ def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str
     except csv.Error as error:
         raise InvalidInputError(f"{str(file)!r} is no table: {error}, in line {lines.line_num}.") from error
     names = header or [name.lower() for name in (cells.pop(0) if cells else ())]
+    if not header and len(names) > 1 and not names[0]:  # the row numbers of pandas
+        names, cells = names[1:], [row[1:] for row in cells]
     width = max((place for row in (names, *cells) for place, cell in enumerate(row, start=1) if cell), default=0)
     names, cells = names[:width], [row[:width] for row in cells]
     odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]

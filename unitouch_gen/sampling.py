@@ -152,7 +152,9 @@ def prepare_steps(
     check_number("init_strength", init_strength, 0.0, 1.0)
     if tolerance is None:
         if max_evaluations is not None:
-            raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but needs a `tolerance`; leave it out.")
+            raise InvalidInputError(
+                f"`max_evaluations` is {describe(max_evaluations)}, but needs a `tolerance`; leave it out."
+            )
         levels = config.get("num_train_timesteps", 1000)
         whole = 50 if num_inference_steps is None else num_inference_steps
         count = max(round(init_strength * check_integer("num_inference_steps", whole, 1, levels)), 1)

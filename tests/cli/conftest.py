@@ -12,7 +12,6 @@ from PIL import Image
 
 from tests.helpers import components
 from unitouch_gen.cli import main
-from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 Result = tuple[int, str, str]
 """Exit code, standard output, standard error."""
@@ -28,15 +27,8 @@ def threads() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def pipes() -> dict[str, Any]:
-    """Pipelines by command; X-to-touch has two sensors."""
-    few: Any = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
-    parts = components.make_components()
-    own = {name: parts[name] for name in ("unitouch", "processor", "scheduler")} | components.make_x_to_touch()
-    return {
-        "stylize": TactileStylizationPipeline(**parts, **few),
-        "touch-to-image": TouchToImagePipeline(**parts, **few),
-        "x-to-touch": XToTouchPipeline(**own, **few, sensors=["gelsight", "digit"]),
-    }
+    """Pipelines by command."""
+    return components.make_pipelines()
 
 
 @pytest.fixture(scope="session")

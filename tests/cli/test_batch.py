@@ -12,8 +12,6 @@ import torch
 from PIL import Image
 
 from tests.helpers import recordings
-from tests.helpers.processes import Child, finished
-from tests.helpers.processes import command as commanded
 
 
 @pytest.fixture
@@ -47,15 +45,19 @@ def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
 
 
 def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, files):
-    """A video goes with the pictures."""
+    """A video goes with the pictures, and so does what is behind a link, once."""
     pytest.importorskip("av")
     for name in ("._a.png", ".DS_Store", "@eaDir/dark.png", ".ipynb_checkpoints/dark-checkpoint.png", "out/old.png"):
         (here / "in" / name).parent.mkdir(exist_ok=True)
         (here / "in" / name).write_bytes((here / "in" / "dark.png").read_bytes())
     recordings.write(here / "in" / "press.MP4", list(recordings.frames()))
+    (here / "far").mkdir()
+    (here / "in" / "dark.png").rename(here / "far" / "dark.png")
+    (here / "in" / "link").symlink_to(here / "far")
+    (here / "far" / "back").symlink_to(here / "in")
     code, _, err = run("in", "-o", "in/out")
     assert (code, err) == (0, "unitouch-gen: 4 other files in in are left out.\n")
-    assert files(here / "in" / "out") == ["bright.png", "dark.png", "manifest.jsonl", "old.png", "press.png"]
+    assert files(here / "in" / "out") == ["bright.png", "link/dark.png", "manifest.jsonl", "old.png", "press.png"]
 
 
 def test_words_and_folders_for_x_to_touch(here, run, files):
@@ -105,15 +107,3 @@ def test_processes_of_a_launcher_share_the_work(here, models):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and done.stdout.count("6 of 6 pictures are in") == 1, done.stderr
     assert sorted(line["seed"] for line in lines(here / "out")) == [*range(6)]
-
-
-def test_a_kill_neither_repeats_nor_loses_a_picture(here, models):
-    (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/dark.png,{seed}\n" for seed in range(6)))
-    words = ["batch", "table.csv", "--batch-size", "2", "--model", models["touch-to-image"], "-o"]
-    whole = finished(Child(commanded, *words, "whole", folder=here))
-    for part in (2, 4):  # of the changes to files that are left
-        assert Child(commanded, *words, "killed", folder=here, killed_at=whole.changes // part).wait() == -9
-    finished(Child(commanded, *words, "killed", folder=here))
-    found = [{file.name: file.read_bytes() for file in (here / name).glob("*.png")} for name in ("whole", "killed")]
-    assert found[0] == found[1] and len(found[0]) == 6
-    assert {Path(line["picture"]).name for line in lines(here / "killed")} == found[0].keys()

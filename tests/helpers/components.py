@@ -1,5 +1,7 @@
 """Tiny randomly initialised components of the pipelines."""
 
+from typing import Any
+
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
@@ -7,6 +9,7 @@ from transformers import CLIPTextConfig, CLIPTextModel
 
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 D = 16
@@ -95,3 +98,15 @@ def make_x_to_touch() -> dict:
         down_block_types=("DownEncoderBlock2D",) * 2, up_block_types=("UpDecoderBlock2D",) * 2,
     )  # fmt: skip
     return {"unet": unet.eval(), "vae": vae.eval(), "embedding_bank": EmbeddingBank.of(torch.randn(20, D)).eval()}
+
+
+def make_pipelines() -> dict[str, Any]:
+    """Pipelines by command; X-to-touch has two sensors."""
+    few: Any = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
+    parts = make_components()
+    own = {name: parts[name] for name in ("unitouch", "processor", "scheduler")} | make_x_to_touch()
+    return {
+        "stylize": TactileStylizationPipeline(**parts, **few),
+        "touch-to-image": TouchToImagePipeline(**parts, **few),
+        "x-to-touch": XToTouchPipeline(**own, **few, sensors=["gelsight", "digit"]),
+    }

@@ -1,12 +1,15 @@
 """Pictures of every accepted kind become the same pixels, squared as CLIP's own processor does; others are refused."""
 
 import io
+import struct
+from contextlib import nullcontext
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from transformers import CLIPImageProcessorPil
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
@@ -77,10 +80,22 @@ def test_a_palette_is_looked_up_and_its_transparent_colour_is_white(processor, t
     palette = Image.new("P", (32, 32))
     palette.putpalette([0, 0, 0, 255, 0, 0, 51, 102, 153])
     palette.putdata([(x + y) % 3 for y in range(32) for x in range(32)])
-    palette.save(tmp_path / "palette.png", transparency=0)
+    for file in (files := [tmp_path / "palette.png", tmp_path / "palette.gif"]):
+        palette.save(file, transparency=0)
     table = np.array([[255] * 3, [255, 0, 0], [51, 102, 153]]) / 255
     expected = pixels_of(table[np.indices((32, 32)).sum(axis=0) % 3])
-    torch.testing.assert_close(processor.raw_images(tmp_path / "palette.png"), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(processor.raw_images(files), expected.expand(2, -1, -1, -1), rtol=0, atol=1e-6)
+
+
+def test_colours_are_those_of_the_profile(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Of one whose red and green are exchanged; sRGB's own and a broken one change nothing."""
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    renamed = srgb.replace("sRGB".encode("utf-16-be"), "mine".encode("utf-16-be"))
+    exchanged = renamed.replace(b"rXYZ", b"....").replace(b"gXYZ", b"rXYZ").replace(b"....", b"gXYZ")
+    for profile, order in ((srgb, [0, 1, 2]), (renamed, [0, 1, 2]), (exchanged, [1, 0, 2]), (b"junk", [0, 1, 2])):
+        Image.fromarray(PICTURE).save(tmp_path / "a.png", icc_profile=profile)
+        found = processor.raw_images(tmp_path / "a.png")
+        torch.testing.assert_close(found, pixels_of(PICTURE[..., order] / 255), rtol=0, atol=1.01 / 255)
 
 
 def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: UniTouchProcessor, tmp_path) -> None:
@@ -96,7 +111,7 @@ def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: Un
 
 
 @pytest.mark.parametrize(
-    ("bits", "dtype"), [(8, np.int32), (8, np.uint16), (10, np.uint16), (12, np.uint16), (14, np.uint16)]
+    ("bits", "dtype"), [(8, "<i4"), (8, "<u2"), (10, "<u2"), (12, "<u2"), (12, ">u2"), (12, "<i2"), (14, "<u2")]
 )
 def test_full_scale_of_deep_greys_is_that_of_the_bits_they_use(processor: UniTouchProcessor, tmp_path, bits, dtype):
     """Of a file as of its array, and told; an ending is not needed."""
@@ -107,6 +122,42 @@ def test_full_scale_of_deep_greys_is_that_of_the_bits_they_use(processor: UniTou
     with pytest.warns(UserWarning, match=f"full scale is taken to be {2**bits - 1}"):
         found = processor.raw_images([tmp_path / "grey", *([values, tmp_path / "grey.npy"] if bits > 8 else [])])
     torch.testing.assert_close(found, pixels_of(values / (2**bits - 1)).expand_as(found), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("form", ["png rgb48be", "png rgba64be", "tiff rgb48le", "tiff rgba64le"])
+def test_full_scale_of_deep_colours_is_that_of_the_bits_they_use(processor: UniTouchProcessor, tmp_path, form, bits):
+    """As of their array, in files that FFmpeg has written; what is transparent is white."""
+    av, (codec, pixel_format) = pytest.importorskip("av"), form.split()
+    values = (np.linspace(0.3, 1, 32 * 32 * 3).reshape(32, 32, 3) * (2**bits - 1)).astype(np.uint16)
+    share = np.linspace(0, 65535, 32).astype(np.uint16)[:, None, None].repeat(32, axis=1)
+    context = av.CodecContext.create(codec, "w")
+    context.height, context.width, context.pix_fmt, context.time_base = 32, 32, pixel_format, Fraction(1)
+    frame = av.VideoFrame.from_ndarray(np.dstack([values, share]), format="rgba64le").reformat(format=pixel_format)
+    (tmp_path / "deep").write_bytes(b"".join(map(bytes, [*context.encode(frame), *context.encode()])))
+    with nullcontext() if bits == 16 else pytest.warns(UserWarning, match=f"full scale is taken to be {2**bits - 1}"):
+        found = processor.raw_images([tmp_path / "deep", Image.open(tmp_path / "deep")])
+    share = share / 65535 if "rgba" in form else 1
+    expected = pixels_of(share * values / (2**bits - 1) + 1 - share).expand_as(found)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1 / 255 if bits == 8 else 1e-5)
+
+
+def test_a_tiff_of_planes_and_one_whose_zero_is_white(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Of 16 bits, uncompressed, by the tables of TIFF 6.0."""
+    values, size = np.linspace(0, 65535, 3 * 32 * 32).reshape(3, 32, 32).astype("<u2"), 2 * 32 * 32
+    at = 8 + 3 * size  # of the lists, behind the pixels
+    lists = struct.pack("<6I4H", 8, 8 + size, 8 + 2 * size, size, size, size, 16, 16, 16, 0)
+    sizes, planes = [(256, 4, 1, 32), (257, 4, 1, 32)], [(258, 3, 3, at + 24), (262, 3, 1, 2), (273, 4, 3, at)]
+    planes += [(277, 3, 1, 3), (278, 4, 1, 32), (279, 4, 3, at + 12), (284, 3, 1, 2)]
+    grey = [(258, 3, 1, 16), (262, 3, 1, 0), (273, 4, 1, 8), (277, 3, 1, 1), (278, 4, 1, 32), (279, 4, 1, size)]
+    for name, own, expected in (("planes", planes, values.transpose(1, 2, 0)), ("grey", grey, 65535 - values[0])):
+        entries = b"".join(struct.pack("<HHII", *entry) for entry in sizes + own)
+        table = struct.pack("<H", 2 + len(own)) + entries + bytes(4)
+        head = struct.pack("<2sHI", b"II", 42, at + len(lists))
+        (tmp_path / name).write_bytes(head + values.tobytes() + lists + table)
+        torch.testing.assert_close(
+            processor.raw_images(tmp_path / name), pixels_of(expected / 65535), rtol=0, atol=1e-5
+        )
 
 
 def test_a_photo_that_moves_is_its_first_frame_and_told(processor: UniTouchProcessor, tmp_path: Path) -> None:

@@ -118,6 +118,13 @@ def test_every_kind_of_samples_gives_the_same_sound() -> None:
         np.testing.assert_allclose(sound.samples, NOISE, atol=1e-6 if sound is not sounds[-1] else 4e-3)
 
 
+@pytest.mark.parametrize(("dtype", "bits"), [("i4", 16), ("i4", 24), ("i8", 16), ("i8", 32)])
+def test_full_scale_of_wide_integers_is_that_of_the_bits_they_use(dtype: str, bits: int) -> None:
+    with pytest.warns(UserWarning, match=f"full scale is taken to be {2 ** (bits - 1)}"):
+        (sound,) = load_sounds("audio", ((2.0 ** (bits - 1) * 0.9 * NOISE).astype(dtype), RATE))
+    np.testing.assert_allclose(sound.samples, 0.9 * NOISE, atol=1e-4)
+
+
 @pytest.mark.parametrize("suffix", ["wav", "flac", "ogg", "mp3"])
 def test_a_file_is_read_with_its_rate_and_channels(suffix: str, tmp_path: Path) -> None:
     left, right = 0.5 * tone(300.0, 0.5, 22_050), 0.5 * tone(700.0, 0.5, 22_050)

@@ -33,7 +33,7 @@ NUMBERS = {
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
     "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
-    "cross_attention_kwargs": ([{"scale": NAN}], [0.5, ["scale"], {"scale": "half"}]),
+    "cross_attention_kwargs": ([{"scale": NAN}], [0, ["scale"], {"scale": "half"}]),
 }  # fmt: skip
 TO_IMAGE = {
     "strength": ([-0.1, NAN, 1e7], ["1", False]), "noise_level": ([-1, 1000], [1.5, NAN, "0"]),

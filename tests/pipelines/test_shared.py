@@ -10,7 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.helpers.calls import seeded, watched
-from unitouch_gen.errors import InvalidTypeError, NonFiniteError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.sampling import ReturnCode
 
 NAN, INF = float("nan"), float("inf")
@@ -78,6 +78,24 @@ def test_threads_that_share_a_pipeline_get_what_serial_calls_get(call):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda options: call.latents(**options), asked))
     assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+
+
+def test_calls_at_the_same_time_leave_the_number_of_threads_to_others_as_it_was(call):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        with ThreadPoolExecutor(6) as pool:
+            list(pool.map(lambda _: call.latents(), range(12)))
+        with ThreadPoolExecutor(1) as pool:  # a new thread
+            assert pool.submit(torch.get_num_threads).result() == torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_pipeline_without_numbers_is_refused(call):
+    call.pipe.to("meta")
+    with pytest.raises(InvalidInputError, match="on the device 'meta'"):
+        call()
 
 
 @pytest.mark.parametrize("solver", [None, "dpm++2m"])

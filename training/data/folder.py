@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_table
+from unitouch_gen.files import files_below, read_table
 from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in
 
 LOOKS_LIKE = ()
@@ -25,11 +25,20 @@ SPLITS = ("train", "val", "test")
 
 
 def read(folder: Path) -> Iterator[Record | str]:
-    """What its table names, or the images in it."""
+    """What its table names, or the images in it; and what is left out."""
     tables = [file for file in found(folder, "*") if file.suffix.lower() in (".csv", ".tsv")]
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
-    yield from read_rows(folder, tables[0]) if tables else read_tree(folder)
+    records = list(read_rows(folder, tables[0]) if tables else read_tree(folder))
+    yield from records
+    used = set(map(str, tables)).union(*(record.files for record in records))
+    others = set(map(str, files_below(folder))) - used
+    unread = [] if tables else [image for image in images_in(folder, "**/*") if str(image) in others]
+    if unread:
+        names = few([image.relative_to(folder).as_posix() for image in unread])
+        yield f"{len(unread)} images are not read, as no touch in `touch` has their names: {names}"
+    if len(others) > len(unread):
+        yield f"{len(others) - len(unread)} other files in {folder} are left out."
 
 
 def read_rows(folder: Path, table: Path) -> Iterator[Record]:
@@ -49,12 +58,11 @@ def read_rows(folder: Path, table: Path) -> Iterator[Record]:
         yield Record(**known, labels={label: row[label] for label in labels if row[label] not in ("", "-1")})
 
 
-def read_tree(folder: Path) -> Iterator[Record | str]:
+def read_tree(folder: Path) -> Iterator[Record]:
     """The images in folders that are named by materials."""
     root = folder / "touch" if (folder / "touch").is_dir() else folder
     parts = [root / part for part in SPLITS if (root / part).is_dir()] or [root]
     pictures, backgrounds = (by_name(folder / tree) if root != folder else {} for tree in ("picture", "background"))
-    used = set[str]()
     for place in [place for part in parts for place in (part, *filter(Path.is_dir, found(part, "*")))]:
         general = next((Frame(str(image)) for image in images_in(place) if image.stem == "background"), None)
         for image in images_in(place):
@@ -64,14 +72,7 @@ def read_tree(folder: Path) -> Iterator[Record | str]:
             picture, background = (tree.get(name.with_suffix("")) for tree in (pictures, backgrounds))
             labels = {} if place in parts else {"material": place.name}
             split = None if parts == [root] else name.parts[0]
-            record = Record(
-                name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split
-            )
-            used |= record.files
-            yield record
-    unread = [image.relative_to(folder).as_posix() for image in images_in(folder, "**/*") if str(image) not in used]
-    if unread:
-        yield f"{len(unread)} images are not read, as no touch in `touch` has their names: {few(unread)}"
+            yield Record(name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split)
 
 
 def by_name(folder: Path) -> dict[Path, Frame]:

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, first_line, needed
-from unitouch_gen.files import is_hidden, natural
+from unitouch_gen.files import files_below, is_hidden, natural
 from unitouch_gen.models.images import load_images
 from unitouch_gen.models.videos import read_video
 
@@ -72,7 +72,7 @@ def few(names: Sequence[str]) -> str:
 
 def found(folder: Path, *patterns: str) -> list[Path]:
     """What patterns find in a folder, in natural order, without hidden files and those in hidden folders."""
-    paths = {path for pattern in patterns for path in folder.glob(pattern)}
+    paths = {path for one in patterns for path in (files_below(folder) if one == "**/*" else folder.glob(one))}
     return sorted((path for path in paths if not is_hidden(path.relative_to(folder))), key=natural)
 
 

@@ -56,6 +56,8 @@ def batch(
     pictures = pictures_of([{"seed": str(seed), **row} for row in rows], columns, folder, output, shared)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
+    if manifest.exists() and not (lines := manifest.read_bytes()).endswith(b"\n"):  # of a disk that was full
+        manifest.write_bytes(lines[: lines.rfind(b"\n") + 1])
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
     most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
@@ -85,11 +87,14 @@ def batch(
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
     """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
+    from unitouch_gen.files import files_below
+
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
-    paths = [file for file in sorted(folder.rglob("*")) if output.resolve() not in file.resolve().parents]
-    places = [file.relative_to(folder) for file in files_in(folder, paths, columns)]
-    return [{columns[place.suffix.lower()]: str(place), "name": str(place.with_suffix(""))} for place in places]
+    paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
+    files = files_in(folder, paths, columns)
+    places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
+    return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
 
 
 def in_table(file: Path) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ from unitouch_gen.errors import InvalidInputError, check_dtype
 if TYPE_CHECKING:
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
-IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
 CLASSES = {

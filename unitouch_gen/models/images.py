@@ -2,14 +2,16 @@
 
 import io
 import os
+import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
@@ -24,8 +26,8 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
     Accepts a path (image or .npy), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
     a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
-    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images with
-    transparency are laid over white, as most viewers show them.
+    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images are in
+    the colours of their profile, and laid over white where they are transparent, as most viewers show them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no whole image, one is too small or too large, an array has a
@@ -66,14 +68,22 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         _check_size(name, *image.size)  # before its pixels are decoded
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
+        if (deep := _deep_colours(image)) is not None:
+            return _by_range(subject, deep[..., :3], deep[..., 3:])
+        inverted = getattr(image, "tag_v2", {}).get(262) == 0  # TIFF's WhiteIsZero, which Pillow heeds up to 8 bits
         image = ImageOps.exif_transpose(image)
         if image.mode == "F":
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
-            return _by_range(subject, np.asarray(image))
+            return _by_range(subject, np.asarray(image), inverted=inverted)
+        profile = image.info.get("icc_profile") or b""
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+        image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
+        with suppress(ImageCms.PyCMSError, OSError):  # as viewers show it where a profile is broken, or of another mode
+            given, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+            image = ImageCms.profileToProfile(image, given, srgb, outputMode="RGB") if profile else image
         return np.array(image.convert("RGB"))
     except InvalidInputError:
         raise
@@ -85,15 +95,40 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         ) from error
 
 
-def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
+def _deep_colours(image: Any) -> np.ndarray | None:
+    """Colours of 16 bits, uint16 (H, W, 3), or (H, W, 4) with their opacity; `None` of other images.
+
+    Pillow keeps one byte of each. Told the other order of bytes, it keeps the other one.
+    """
+    tiles = [(tile, tile.args if isinstance(tile.args, tuple) else (tile.args,)) for tile in getattr(image, "tile", ())]
+    kinds = [str(*args[:1]) for _, args in tiles]  # none once it is decoded
+    planes = {*kinds} == {"R", "G", "B"} and image.tag_v2[258][0] == 16  # which Pillow takes for 8 bits
+    if not planes and not (kinds and all(re.fullmatch("RGB[AX]?;16[BLN]", kind) for kind in kinds)):
+        return None
+    image.fp.seek(0)
+    content, found = image.fp.read(), []
+    for order in "BL":  # the first bytes, and the second ones
+        part: Any = Image.open(io.BytesIO(content))
+        part.seek(image.tell())
+        part.tile = [tile._replace(args=(f"{kind.split(';')[0]};16{order}", *args)) for tile, (kind, *args) in tiles]
+        found.append(np.asarray(ImageOps.exif_transpose(part)))
+    stored = image.tag_v2.prefix.decode()[0] if planes else kinds[0][-1]
+    return np.stack(found, axis=-1).view({"N": "=u2", "L": "<u2", "I": "<u2"}.get(stored, ">u2"))[..., 0]
+
+
+def _by_range(subject: str, values: np.ndarray, opacity: Any = None, inverted: bool = False) -> np.ndarray:
     """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
     low, high = int(values.min()), int(values.max())
     if low < 0 or high >= 1 << 16:
         raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
     bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
+    full = 2**bits - 1
     if bits < 16:
-        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {2**bits - 1}.", stacklevel=2)
-    return values.astype(np.uint8) if bits == 8 else (values / (2**bits - 1)).astype(np.float32)
+        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full}.", stacklevel=2)
+    if opacity is not None and opacity.size:  # of 16 bits, (H, W, 1)
+        values = full - opacity / 65535 * (full - values)
+    values = full - values if inverted else values
+    return values.astype(np.uint8) if bits == 8 else (values / full).astype(np.float32)
 
 
 def _channels_first(name: str, array: np.ndarray) -> Tensor:
@@ -104,7 +139,7 @@ def _channels_first(name: str, array: np.ndarray) -> Tensor:
     if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
         wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
         raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
-    if array.dtype == np.uint16 and array.size and array.max() > 255:
+    if array.dtype.kind in "ui" and array.dtype.itemsize == 2 and array.size and array.max() > 255:
         pixels = _by_range(f"`{name}`", pixels)
     elif array.dtype != np.uint8:
         pixels = pixels.astype(np.float64 if array.dtype.kind in "fb" else np.int64)

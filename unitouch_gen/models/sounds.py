@@ -36,7 +36,7 @@ def load_sounds(name: str, sounds: AudioInput) -> list[Sound]:
     """Mono sounds.
 
     Accepts a path (wav, flac, ogg, mp3), a pair of an array or tensor (T,) or (channels, T) and its rate in Hz, and
-    lists of them.
+    lists of them. Integers of 32 bits or more that use but 16 or 24 are read as these.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no sound, samples are missing, not finite or of a wrong shape,
@@ -65,6 +65,11 @@ def _load(name: str, sound: Any) -> Sound:
     if samples.size < 2 or samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
         raise InvalidInputError(f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), T at least 2.")
     full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
+    if full_scale > 1 << 15 and (samples & 255).any():  # none of fewer bits that stand at the top
+        peak = max(int(samples.max()), -int(samples.min()))
+        usual, full_scale = full_scale, 2.0 ** (15 if peak <= 1 << 15 else 23 if peak <= 1 << 23 else 31)
+        if full_scale < usual:
+            warnings.warn(f"`{name}` holds up to {peak}; full scale is taken to be {full_scale:.0f}.", stacklevel=2)
     with np.errstate(all="ignore"):
         channels = np.atleast_2d(samples)
         mean, power = channels.mean(axis=0), channels.var(axis=1)
