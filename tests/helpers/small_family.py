@@ -7,6 +7,7 @@ import torch
 from diffusers import AutoencoderTiny, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
+from tests.helpers.language import make_language_parts
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
@@ -38,6 +39,11 @@ def write_small_family(folder: Path) -> None:
         shutil.copy(part / "defaults.json", folder / part.name)
     shutil.copytree(weights.TOUCH_TO_IMAGE / "image_noising_scheduler", unclip / "image_noising_scheduler")
     StableUnCLIPImageNormalizer(embedding_dim=width).half().save_pretrained(unclip / "image_normalizer")
+    language, parts = folder / weights.TOUCH_TO_TEXT.name, make_language_parts()
+    parts["language_bridge"].half().save_pretrained(language / "language_bridge")
+    parts["language_model"].half().save_pretrained(language / "language_model")
+    parts["tokenizer"].save_pretrained(language / "language_model")
+    shutil.copy(weights.TOUCH_TO_TEXT / "defaults.json", language)
     EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(folder / weights.EMBEDDING_BANK.name)
     unet = UNet2DConditionModel.load_config(weights.X_TO_TOUCH / "unet")
     gels = torch.randn(unet["num_class_embeds"] - 1, unet["out_channels"], *[unet["sample_size"]] * 2)

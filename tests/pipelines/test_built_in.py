@@ -65,7 +65,7 @@ def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_pat
 def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):
     write_small_family(tmp_path)
     for name in PIPELINES:
-        assert unitouch_gen.tiny(name, family=tmp_path, dtype="bfloat16").unet.dtype is torch.bfloat16
+        assert unitouch_gen.tiny(name, family=tmp_path, dtype="bfloat16").dtype is torch.bfloat16
     file = tmp_path / weights.X_TO_TOUCH.name / "unet" / "diffusion_pytorch_model.safetensors"
     save_file(dict(list(load_file(file).items())[1:]), file, metadata={"format": "pt"})
     with pytest.raises(InvalidInputError, match="`family` "):
@@ -75,3 +75,11 @@ def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):
     for wrong in (*families, {"name": "touch-to-imag"}, {"dtype": "int8"}):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(wrong))}` "):
             unitouch_gen.tiny(**{"name": "x-to-touch", **wrong})
+
+
+def test_answers_name_what_was_touched_or_seen():
+    pipe = unitouch_gen.tiny("touch-to-text")
+    names = ["brick", "leather", "wood"]
+    touches = pipe([unitouch_gen.example(name) for name in names], "What is it?")
+    assert touches.texts == [f"it is {name}." for name in names] and len(touches.report.tokens) == 3
+    assert pipe(image=unitouch_gen.example("metal", "image"), question="What is it?").texts == ["it is metal."]
