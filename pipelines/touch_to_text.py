@@ -135,7 +135,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         mask = torch.tensor([[0] * (width - size) + [1] * size for size in report.prompt_tokens], device=device)
         rows = embeds.expand(len(prompts), -1).to(device)
         model, attach = self.language_model, self.language_bridge.attach
-        with report.stage("answer"), _ANSWERING, seeded(generator, device), attach(model, rows):
+        with report.stage("answer"), _ANSWERING, seeded(generator, device), attach(model, rows), usable(generate):
             made = model.generate(ids, attention_mask=mask, generation_config=config, **options)
 
         # 4. Decode them
@@ -196,10 +196,10 @@ class TouchToTextPipeline(UniTouchPipeline):
             raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
         if given.get("streamer") is not None and len(prompts) > 1:
             raise InvalidInputError(f"`streamer` is for one answer, not for {len(prompts)}; leave it out.")
-        try:
+        for name in ("num_beams", "num_return_sequences"):
+            check_integer(name, given.get(name, 1), 1)
+        with usable(given):
             others = config.update(**given)
-        except (ValueError, TypeError) as error:
-            raise InvalidInputError(f"`generate` cannot use its options: {first_line(error)}") from error
         ends = tokenizer.eos_token_id if config.eos_token_id is None else config.eos_token_id
         config.eos_token_id = ends if isinstance(ends, list) else [ends]
         pads = (config.pad_token_id, tokenizer.pad_token_id, config.eos_token_id[0])
@@ -216,6 +216,17 @@ class TouchToTextPipeline(UniTouchPipeline):
         if unitouch is not None:
             parts["unitouch"], parts["processor"] = read_joint(unitouch, dtype, {})
         return cls(**parts)
+
+
+@contextmanager
+def usable(options: dict[str, Any]) -> Iterator[None]:
+    """Tells what transformers says of options that `generate` cannot use."""
+    try:
+        yield
+    except (ValueError, TypeError, AttributeError) as error:
+        if not options:
+            raise
+        raise InvalidInputError(f"`generate` cannot use its options: {first_line(error)}") from error
 
 
 @contextmanager

@@ -113,6 +113,7 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("max_new_tokens", InvalidTypeError, {**two, "max_new_tokens": 2.5}),
         ("temperatur", InvalidInputError, {**two, "temperatur": 0.5}),
         ("generate", InvalidInputError, {**two, "early_stopping": "soon"}),
+        ("num_beams", InvalidInputError, {**two, "num_beams": 0}),
         ("streamer", InvalidInputError, {**two, "streamer": TextIteratorStreamer(ask.tokenizer)}),
         ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
         ("generator", InvalidTypeError, {**two, "generator": 3}), ("bridge", InvalidTypeError, {**two, "bridge": "x"}),
@@ -124,6 +125,12 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         assert type(caught.value) is error
     with pytest.raises(AssertionError, match="ran on input"):
         ask(**two)
+
+
+@pytest.mark.parametrize("option", [{"top_k": -1, "do_sample": True}, {"streamer": 3}, {"logits_processor": [3]}])
+def test_what_transformers_refuses_is_told_in_its_words(ask, option):
+    with pytest.raises(InvalidInputError, match=r"`generate` cannot use its options: .{10}"):
+        ask(touch_embeds=EMBEDS[:1], question=QUESTION, **option)
 
 
 def test_parts_that_do_not_fit_are_refused(components):
