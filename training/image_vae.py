@@ -110,6 +110,8 @@ def read_autoencoder(folder: Path) -> Autoencoder:
 def main(stage: Stage, modality: str = "image") -> None:
     recipe: AutoencoderRecipe = stage.recipe
     vae, crop = make_autoencoder(recipe.model), recipe.augment.crop
+    if "init" in stage.folders:
+        vae = read_autoencoder(stage.folders["init"]).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
     splits = stage.splits(modality)

@@ -48,7 +48,7 @@ STAGES: dict[str, dict[str, str]] = {
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
-STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
+STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
 
@@ -117,7 +117,10 @@ class Stage:
     @cached_property
     def processor(self) -> UniTouchProcessor:
         """That of the joint space, or of the weights to start from; else what the recipe says."""
-        if folder := self.folders.get("joint") or self.folders.get("init"):
+        init = self.folders.get("init")
+        if init is not None and not (init / "preprocessor_config.json").is_file():
+            init = None  # an autoencoder or a UNet
+        if folder := self.folders.get("joint", init):
             return UniTouchProcessor.from_pretrained(folder)
         return UniTouchProcessor(image_size=self.data.image_size, audio=self.data.audio)  # type: ignore[arg-type]
 

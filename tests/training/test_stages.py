@@ -124,6 +124,8 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
     words = [UniTouchProcessor.from_pretrained(one).tokenizer.get_vocab() for one in (began, runs / "kept" / "model")]
     record = json.loads((runs / "kept" / "record.json").read_text())
     assert words[0] == words[1] and record["started_from"] == {"seed": 3}
+    stage(runs, "image_vae", "--init", str(runs / "image_vae" / "model"), output="vae-again")
+    assert json.loads((runs / "vae-again" / "record.json").read_text())["started_from"]["stage"] == "image_vae"
     with pytest.raises(SystemExit, match="2"):
         stage(runs, "image_text", "--resume", *changed, output="kept")  # without the weights that it started from
 
