@@ -40,8 +40,8 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, read_settings, reading, writing_folder
-from unitouch_gen.models.autoencoders import autoencoder_class, decode, encode, scale_factor
+from unitouch_gen.files import as_path, local_folder, reading, writing_folder
+from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
@@ -402,9 +402,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         kwargs.setdefault(key, torch.float32)
         if not isinstance(kwargs[key], dict):  # dict: dtypes by component
             kwargs[key] = check_dtype(key, kwargs[key])
-        folder = local_folder(
-            name, pretrained_model_name_or_path, **kwargs
-        )  # diffusers' download cannot resolve our components
+        # diffusers' download cannot resolve our components.
+        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
             conditioning = ("embedding_bank", "backgrounds", "image_normalizer", "language_bridge")
@@ -522,18 +521,13 @@ def check_filled(folder: Path, network: Any) -> None:
         )
 
 
-def autoencoder_in(folder: Path) -> Any:
-    """The class of a stored autoencoder."""
-    return autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
-
-
 def read_scheduler(folder: Path) -> SchedulerMixin:
     """The scheduler of a checkpoint, of the class of diffusers that its config names."""
     name = DDIMScheduler.load_config(folder)["_class_name"]
     kind = getattr(diffusers, name, None)
     if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return getattr(diffusers, name).from_pretrained(folder)
+    return kind.from_pretrained(folder)
 
 
 def check_unused(instead: str, **given: Any) -> None:

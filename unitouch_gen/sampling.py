@@ -49,10 +49,7 @@ class ReturnCode(StrEnum):
     SUCCESS = "success", "The sample is finite."
     NON_FINITE = "non_finite", "Not finite. Lower `guidance_scale` or `strength`, take more steps, or run in float32."
     DIVERGED = "diverged", "Far larger than the latents of pictures. Lower `guidance_scale`, or take more steps."
-    MAX_EVALUATIONS = (
-        "max_evaluations",
-        "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`.",
-    )
+    MAX_EVALUATIONS = "max_evaluations", "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`."
     INTERRUPTED = "interrupted", "Interrupted, with noise left in the sample. Call again to finish it."
 
     @property

@@ -191,8 +191,8 @@ def decoded(
     }
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
-    told = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
-    fingerprint = hashlib.sha256(told.encode()).hexdigest()[:16]
+    state = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
+    fingerprint = hashlib.sha256(state.encode()).hexdigest()[:16]
     columns: dict[str, Any] = dict.fromkeys(kinds)
     for name, (read, (dtype, *shape)) in kinds.items():
         if name in needs:
