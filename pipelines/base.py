@@ -58,11 +58,9 @@ MAX_IMAGES = 100_000  # maximum per input
 MAX_SIDE = 16_384  # pixels
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
-SMALL_NETWORK = 20_000_000
-"""Parameters below which threads of a CPU wait for each other longer than they work."""
+SMALL_NETWORK = 20_000_000  # parameters; on a CPU, threads of a smaller one mostly wait for each other
 
-
-_threads: list[int] = []  # how many torch had before the first of the calls that run now, for each of these
+_threads: list[int] = []  # for each running call, how many threads torch had before the first of them
 
 
 def runs_networks(method: Method) -> Method:
@@ -120,9 +118,10 @@ class Touches:
 
 
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
-    """A latent diffusion model conditioned on embeddings of the joint space.
+    """A network conditioned on embeddings of the joint space.
 
-    Subclasses have the components `unitouch`, `processor`, `unet`, `scheduler`, `vae` and `embedding_bank`.
+    Subclasses have the components `unitouch`, `processor` and `embedding_bank`; those that make images also have
+    `unet`, `scheduler` and `vae`.
     """
 
     _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
@@ -133,14 +132,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _card: Card | Path | None = None  # or the folder with the card
 
     def _finish_init(self, network: str, **defaults: float) -> None:
-        """Stores defaults in the config, and checks the widths of embeddings."""
+        """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
         self._check_widths(network)
 
     def _check_widths(self, network: str) -> None:
-        """Raises if the embeddings of a part have another width than a network takes."""
+        """Raises if the joint space or the bank has embeddings of another width than the network takes."""
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
             "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,

@@ -1,4 +1,4 @@
-"""Reads published weights: a converted joint space, an unCLIP pipeline, a latent diffusion model of touch."""
+"""Reads published weights: a converted joint space and an unCLIP pipeline."""
 
 import math
 import os
@@ -17,7 +17,7 @@ from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.base import check_filled
 
-SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options; `revision` belongs to one repository
+SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options of both; `revision` is of the unCLIP
 
 
 def read_joint(

@@ -1,9 +1,9 @@
 """Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
 
-Drawn contacts can be seen under two lamps, whose pictures are told from those of contacts like them, as SimCLR does
-(Chen et al., 2020): captions do not say which contact it is, and a touch is to be bound to its own picture.
+Pictures of a drawn contact under two lamps can be bound to each other, as SimCLR binds views of an image (Chen et al.,
+2020). Captions do not say which contact a picture shows, and touches are bound to single pictures later.
 
-With `--init` it goes on from the encoders, tokenizer and sizes of a joint space, whatever the recipe says of these.
+`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's.
 
 python -m unitouch_gen.training.image_text --output runs/image_text
 """

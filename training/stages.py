@@ -175,7 +175,7 @@ class Stage:
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
-        """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
+        """The folder to write the stage's model to; `record.json` beside it has seed, recipe, inputs and times."""
         record: dict[str, Any] = {
             "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
             "inputs": self.inputs, "trainer": self.trainer.model_dump(),

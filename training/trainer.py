@@ -213,7 +213,7 @@ def checkpoints_in(output: Path) -> list[Path]:
 
 
 def read_progress(output: Path) -> dict[str, Any]:
-    """What a run's last checkpoint holds beside its state: `step`, `seconds`, and what the trainer was given."""
+    """The progress of a run's last checkpoint: `step`, `seconds`, and what `Trainer` was passed as `progress`."""
     if found := checkpoints_in(output):
         return read_settings("resume", found[-1] / "progress.json")
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")

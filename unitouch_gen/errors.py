@@ -1,4 +1,4 @@
-"""Error types, and the checks of arguments, each of which returns what came.
+"""Error types, and the checks of arguments, each of which returns the checked value.
 
 A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used an `InvalidInputError`; the message
 names the argument, what came, and what to do.

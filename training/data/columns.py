@@ -145,9 +145,7 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
 
     arrays: Any = mapped(folder, len(material), columns, write)
     if json.loads((folder / "settings.json").read_text()) != settings:
-        raise InvalidInputError(
-            f"`cache` holds {str(folder)!r} with other settings of sounds; delete it, or name another."
-        )
+        raise InvalidInputError(f"`cache` holds {str(folder)!r} with other settings of sounds; delete it.")
     text = json.loads((folder / "text.json").read_text())
     return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
 

@@ -149,7 +149,7 @@ def solver_fields(pipe: Any) -> Fields:
 
 
 def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
-    """Pictures, what they feel like, the run report and the seed; what the call refuses is told in the page."""
+    """Pictures, what they feel like, the run report and the seed; errors are shown in the page."""
     given = {name: value for name, value in given.items() if value not in (None, "")}
     seed = int(given.pop("seed", random.randrange(2**31)))
     if "tolerance" in given:
@@ -171,7 +171,7 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
 
 @contextmanager
 def refusing(uploads: Iterable[str]) -> Iterator[None]:
-    """Tells in the page what a call refuses, with the names of uploads, and not where they lie here."""
+    """Shows the errors of a call in the page, with the names of uploads in place of their paths."""
     try:
         yield
     except (ValueError, TypeError, ArithmeticError) as error:
