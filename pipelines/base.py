@@ -194,9 +194,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if latents is not None:
             check_tensor("latents", latents, *shape)
         if isinstance(generator, list) and len(generator) != batch_size:
-            raise InvalidInputError(
-                f"`generator` is a list of {len(generator)} for {batch_size} pictures; pass one, or one for each."
-            )
+            raise InvalidInputError(f"`generator` has {len(generator)} for {batch_size} images; pass one, or one each.")
         for one in generator if isinstance(generator, list) else [generator] * (generator is not None):
             check_kind("generator", one, torch.Generator)
         return shape

@@ -213,9 +213,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
         )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
-        prompts = self._check_prompts(
-            batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        )
+        positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
+        prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
 
         # 2. Encode the touch
         report = RunReport()

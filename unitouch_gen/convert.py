@@ -142,9 +142,7 @@ def read_published(
     if touch is None and imagebind is None:
         raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
     if config.sensors:
-        raise InvalidInputError(
-            "`config` names sensors, but the published files hold no sensor tokens; leave them out."
-        )
+        raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
     wanted = None if dtype is None else check_dtype("dtype", dtype)
     model: Any = UniTouchModel(config, modalities=()).eval()
     for name, path in (("imagebind", imagebind), ("touch", touch)):

@@ -149,9 +149,7 @@ def prepare_steps(
     check_number("init_strength", init_strength, 0.0, 1.0)
     if tolerance is None:
         if max_evaluations is not None:
-            raise InvalidInputError(
-                f"`max_evaluations` is {describe(max_evaluations)}, but needs a `tolerance`; leave it out."
-            )
+            raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
         levels = config.get("num_train_timesteps", 1000)
         whole = 50 if num_inference_steps is None else num_inference_steps
         count = max(round(init_strength * check_integer("num_inference_steps", whole, 1, levels)), 1)
@@ -165,9 +163,7 @@ def prepare_steps(
         return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
     for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
         if value is not None:
-            raise InvalidInputError(
-                f"`{name}` is {describe(value)}, but `tolerance` was given, which sets the steps; leave one out."
-            )
+            raise InvalidInputError(f"`{name}` is {describe(value)}, but `tolerance` sets the steps; leave one out.")
     check_number("tolerance", tolerance, 1e-5, 1.0)
     limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
     start = schedule.karras_level(1.0 - init_strength)

@@ -60,7 +60,7 @@ def test_steps_that_cannot_be_made_are_refused():
         ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but `tolerance` was given"),
         ({"tolerance": 1e-6}, "`tolerance` is 1e-06"),
         ({"tolerance": 0.1, "max_evaluations": 1}, "`max_evaluations` is 1"),
-        ({"max_evaluations": 9}, "`max_evaluations` is 9, but needs a `tolerance`"),
+        ({"max_evaluations": 9}, "`max_evaluations` is 9; it needs a `tolerance`"),
         ({"eta": 2.0}, "`eta` is 2"),
         ({"init_strength": -1.0}, "`init_strength` is -1"),
         ({"init_strength": 0.5, "scheduler": FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),

@@ -56,9 +56,7 @@ class DataConfig(Settings):
     def sources(self) -> list[Source]:
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
         if self.drawn is None and not self.sets:
-            raise InvalidInputError(
-                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts."
-            )
+            raise InvalidInputError("`data` names nothing to learn; give it `sets`, as [{path: FOLDER}], or `drawn`.")
         drawn = self.drawn.sources() if self.drawn else []
         return [*drawn, *(part for one in self.sets for part in one.read())]
 

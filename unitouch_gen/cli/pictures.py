@@ -105,9 +105,7 @@ def x_to_touch(
     most = max(map(len, inputs.values()))
     for name, values in inputs.items():
         if len(values) not in (1, most):
-            raise InvalidInputError(
-                f"`--{name}` was given {len(values)} times, another {most} times; pass one, or as many."
-            )
+            raise InvalidInputError(f"`--{name}` was given {len(values)} times, another {most}; pass one, or as many.")
     pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **context.params)
     known = list(pipe.config.sensors)
     drawn = known if sensor and "all" in sensor else sensor or ([] if background else known[:1])

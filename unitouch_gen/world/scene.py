@@ -128,9 +128,8 @@ class World:
             if "depth" in asked:
                 scene.depth[sensor.name] = in_view(displacement, size)
             if "attributes" in asked:
-                scene.attributes[sensor.name] = contact_attributes(
-                    in_view(indentation, size), sensor.field_of_view, draws.compliance
-                )
+                pressed, view = in_view(indentation, size), sensor.field_of_view
+                scene.attributes[sensor.name] = contact_attributes(pressed, view, draws.compliance)
 
         # 4. Grasps, sounds and captions.
         if "grasp" in asked:
@@ -173,9 +172,7 @@ def _numbers(label: str, values: object, count: int | None = None, most: float =
     try:
         numbers = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidTypeError(
-            f"`{label}` cannot be read as integers ({first_line(error)}); pass one for each contact."
-        ) from error
+        raise InvalidTypeError(f"`{label}` cannot be read as integers ({first_line(error)}); pass one each.") from error
     if numbers.is_sparse or numbers.dtype == torch.bool or not torch.can_cast(numbers.dtype, torch.int64):
         raise InvalidTypeError(f"`{label}` is {describe(values)}; it has to hold integers.")
     if numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
