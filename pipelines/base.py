@@ -277,15 +277,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     # From conditioning to pictures ------------------------------------------------------------------------------------
 
     def _denoise(
-        self,
-        settings: CallSettings,
-        hidden_states: Tensor,
-        class_labels: Tensor | None,
-        report: RunReport,
-        init: Tensor | None = None,
-        extra_channels: Tensor | None = None,
+        self, settings: CallSettings, hidden_states: Tensor, class_labels: Tensor | None, report: RunReport,
+        init: Tensor | None = None, extra_channels: Tensor | None = None,
         wrap: Callable[[Network], Network] | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Noise -> latents (B n, C, h, w) in float32.
 
         Args:

@@ -85,14 +85,9 @@ class XToTouchPipeline(UniTouchPipeline):
     ):
         super().__init__()
         self.register_modules(
-            unitouch=unitouch,
-            processor=processor,
-            embedding_bank=embedding_bank,
-            backgrounds=backgrounds,
-            unet=unet,
-            scheduler=scheduler,
-            vae=vae,
-        )
+            unitouch=unitouch, processor=processor, embedding_bank=embedding_bank, backgrounds=backgrounds, unet=unet,
+            scheduler=scheduler, vae=vae,
+        )  # fmt: skip
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
             "`unet`",
@@ -127,16 +122,10 @@ class XToTouchPipeline(UniTouchPipeline):
 
     @runs_networks
     def encode_condition(
-        self,
-        image: ImageInput = None,
-        text: str | list[str] | None = None,
-        audio: AudioInput = None,
-        touch: ImageInput = None,
-        *,
-        weights: Mapping[str, float] | None = None,
-        bridge: bool | None = None,
+        self, image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,
+        touch: ImageInput = None, *, weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         source_sensor: SensorNames = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}

@@ -61,13 +61,9 @@ class TouchDiffusionObjective(nn.Module):
     """
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: DDPMScheduler,
-        embedding_norm: float,
-        settings: TouchDiffusionSettings,
-        backgrounds: Tensor | None = None,
-    ):
+        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, embedding_norm: float,
+        settings: TouchDiffusionSettings, backgrounds: Tensor | None = None,
+    ):  # fmt: skip
         super().__init__()
         self.trained = unet
         self.scheduler, self.embedding_norm, self.settings = scheduler, embedding_norm, settings

@@ -74,14 +74,9 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        objective: nn.Module,
-        dataset: ArrayDataset,
-        indices_of: Callable[[int], Sequence[int]],
-        config: TrainerConfig,
-        output: Path,
-        progress: Mapping[str, Any] | None = None,
-    ):
+        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]],
+        config: TrainerConfig, output: Path, progress: Mapping[str, Any] | None = None,
+    ):  # fmt: skip
         self.config, self.output, self.progress = config, output, dict(progress or {})
         self.dataset, self.indices_of = dataset, indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)

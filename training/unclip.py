@@ -54,16 +54,10 @@ class UnclipObjective(nn.Module):
     """
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: DDPMScheduler,
-        settings: UnclipSettings,
-        normalizer: StableUnCLIPImageNormalizer,
-        noising: DDPMScheduler,
-        captions: list[str],
-        processor: UniTouchProcessor,
-        text_encoder: nn.Module,
-    ):
+        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, settings: UnclipSettings,
+        normalizer: StableUnCLIPImageNormalizer, noising: DDPMScheduler, captions: list[str],
+        processor: UniTouchProcessor, text_encoder: nn.Module,
+    ):  # fmt: skip
         super().__init__()
         self.trained, self.scheduler, self.settings = unet, scheduler, settings
         self.frozen = (normalizer, text_encoder.eval())  # in a tuple, so that they are no modules of the objective

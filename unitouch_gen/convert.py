@@ -120,12 +120,9 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
 
 
 def read_published(
-    touch: str | os.PathLike | None = None,
-    imagebind: str | os.PathLike | None = None,
-    *,
-    config: UniTouchConfig | None = None,
-    dtype: torch.dtype | None = None,
-) -> UniTouchModel:
+    touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None, *,
+    config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
+) -> UniTouchModel:  # fmt: skip
     """A joint space of the published checkpoints.
 
     Args:
@@ -250,14 +247,9 @@ def read_config(name: str, file: Path) -> UniTouchConfig:
 
 
 def convert_published(
-    output: str | os.PathLike,
-    *,
-    touch: str | os.PathLike | None = None,
-    imagebind: str | os.PathLike | None = None,
-    tokenizer: str | os.PathLike | None = None,
-    config: UniTouchConfig | None = None,
-    dtype: torch.dtype | None = None,
-) -> list[str]:
+    output: str | os.PathLike, *, touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None,
+    tokenizer: str | os.PathLike | None = None, config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
+) -> list[str]:  # fmt: skip
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
     Args:

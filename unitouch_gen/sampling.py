@@ -125,16 +125,10 @@ class Steps:
 
 
 def prepare_steps(
-    scheduler: SchedulerMixin,
-    *,
-    solver: str | None = None,
-    num_inference_steps: int | None = None,
-    tolerance: float | None = None,
-    max_evaluations: int | None = None,
-    eta: float = 0.0,
-    init_strength: float = 1.0,
+    scheduler: SchedulerMixin, *, solver: str | None = None, num_inference_steps: int | None = None,
+    tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0, init_strength: float = 1.0,
     device: torch.device | str = "cpu",
-) -> Steps:
+) -> Steps:  # fmt: skip
     """Validates the step arguments of a call, before any network runs.
 
     `num_inference_steps` (default 50) or `tolerance`, a relative RMS error of the latents from 1e-5 to 1, sets the
@@ -246,18 +240,10 @@ class _EndedError(Exception):
 
 @torch.no_grad()
 def sample(
-    network: Network,
-    noise: Tensor,
-    steps: Steps,
-    report: RunReport,
-    *,
-    guidance: Guidance = Guidance(1.0),
-    init: Tensor | None = None,
-    generator: Any = None,
-    throw: bool = True,
-    on_step: OnStep | None = None,
+    network: Network, noise: Tensor, steps: Steps, report: RunReport, *, guidance: Guidance = Guidance(1.0),
+    init: Tensor | None = None, generator: Any = None, throw: bool = True, on_step: OnStep | None = None,
     progress: Callable[[float], object] = lambda share: None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """From noise to latents, float32 (B, C, h, w). Non-finite samples are returned as zeros.
 
     Args:

@@ -89,12 +89,8 @@ def has(record: Record, need: str) -> bool:
 
 
 def columns_of(
-    sources: Sequence[Source],
-    cache: Path,
-    config: DataConfig,
-    processor: UniTouchProcessor,
-    needs: Sequence[str],
-) -> list[Rendered]:
+    sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str],
+) -> list[Rendered]:  # fmt: skip
     """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
     `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
@@ -162,13 +158,9 @@ def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.
 
 
 def decoded(
-    cache: Path,
-    data: RecordSet,
-    processor: UniTouchProcessor,
-    needs: Sequence[str],
-    materials: Sequence[str] = (),
+    cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], materials: Sequence[str] = (),
     touch_size: int | None = None,
-) -> Rendered:
+) -> Rendered:  # fmt: skip
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
     Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave

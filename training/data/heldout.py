@@ -100,15 +100,9 @@ Sets = Iterator[tuple[str, bool, int, Splits]]
 
 
 def of_world(
-    cache: Path,
-    model: UniTouchModel,
-    processor: UniTouchProcessor,
-    sensors: Sequence[str],
-    seeds: Sequence[int],
-    objects: int,
-    *,
-    grasps: bool = False,
-) -> Sets:
+    cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sensors: Sequence[str], seeds: Sequence[int],
+    objects: int, *, grasps: bool = False,
+) -> Sets:  # fmt: skip
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
     for seed, sensor in product(seeds, (*sensors, None)):
         source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects)

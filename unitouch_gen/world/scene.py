@@ -76,14 +76,10 @@ class World:
 
     @torch.no_grad()
     def render(
-        self,
-        material: Sequence[int] | Tensor,
-        object: Sequence[int] | Tensor,
-        contact: Sequence[int] | Tensor,
-        *,
+        self, material: Sequence[int] | Tensor, object: Sequence[int] | Tensor, contact: Sequence[int] | Tensor, *,
         modalities: Sequence[str] = ("image", "touch", "audio", "text"),
         sensors: Sequence[str | Sensor] = ("gelsight",),
-    ) -> Scene:
+    ) -> Scene:  # fmt: skip
         """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
 
         Args:
