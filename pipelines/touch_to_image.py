@@ -92,12 +92,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         if labels != 2 * width:
             raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
         self._finish_init(
-            "the unCLIP model",
-            default_strength=default_strength,
-            default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps,
-            default_noise_level=default_noise_level,
-        )
+            "the unCLIP model", default_strength=default_strength, default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps, default_noise_level=default_noise_level,
+        )  # fmt: skip
 
     @property
     def embedding_dim(self) -> int:

@@ -71,18 +71,13 @@ class XToTouchPipeline(UniTouchPipeline):
     _lora_loadable_modules = ["unet"]
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny | VQModel,
-        unitouch: UniTouchModel | None = None,
-        processor: UniTouchProcessor | None = None,
-        embedding_bank: EmbeddingBank | None = None,
+        self, unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderTiny | VQModel, unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None, embedding_bank: EmbeddingBank | None = None,
         backgrounds: SensorBackgrounds | None = None,
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of other annotations
-        default_guidance_scale: float = 7.5,
-        default_num_inference_steps: int = 200,
-    ):
+        default_guidance_scale: float = 7.5, default_num_inference_steps: int = 200,
+    ):  # fmt: skip
         super().__init__()
         self.register_modules(
             unitouch=unitouch, processor=processor, embedding_bank=embedding_bank, backgrounds=backgrounds, unet=unet,
@@ -90,10 +85,9 @@ class XToTouchPipeline(UniTouchPipeline):
         )  # fmt: skip
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
-            "`unet`",
-            default_guidance_scale=default_guidance_scale,
+            "`unet`", default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
-        )
+        )  # fmt: skip
         self._check_parts()
 
     def _check_parts(self) -> None:
@@ -253,10 +247,7 @@ class XToTouchPipeline(UniTouchPipeline):
     # Checks -----------------------------------------------------------------------------------------------------------
 
     def _prepare(
-        self,
-        given: Mapping[str, Any],
-        weights: Mapping[str, float] | None,
-        source_sensor: SensorNames,
+        self, given: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
     ) -> tuple[Conditions, int]:
         """Reads the given modalities; also returns the number of inputs, B."""
         given = {name: value for name, value in given.items() if value is not None}

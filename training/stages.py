@@ -157,10 +157,7 @@ class Stage:
             raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
 
     def fit(
-        self,
-        objective: nn.Module,
-        dataset: ArrayDataset,
-        indices_of: Callable[[int], Sequence[int]] | None = None,
+        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]] | None = None
     ) -> None:
         """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:

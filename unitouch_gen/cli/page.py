@@ -12,6 +12,7 @@ import torch
 from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
+from unitouch_gen.world.questions import QUESTIONS
 
 Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
@@ -66,12 +67,7 @@ def asking_tab(pipe: Any) -> None:
     with gradio.Row():
         with gradio.Column():
             touch = upload("touch", "Touch")
-            asked = [
-                "What is it made of?",
-                "How does it feel?",
-                "Where is the contact?",
-                "Which way does the grain run?",
-            ]
+            asked = [wordings[0] for topic, wordings in QUESTIONS.items() if topic != "caption"]
             question = gradio.Dropdown(asked, value=asked[1], label="Question", allow_custom_value=True)
             button = gradio.Button("Ask", variant="primary")
         with gradio.Column():

@@ -23,7 +23,6 @@ from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
-from unitouch_gen.world.grasps import grasp_margin
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.sensors import SENSORS, Sensor
@@ -149,6 +148,15 @@ class World:
             rng = generator(self.seed, SENSOR_STREAM, number, *name)
             image += sensor.noise * torch.from_numpy(rng.standard_normal(tuple(image.shape), dtype=np.float32))
         return images.clamp_(0.0, 1.0)
+
+
+def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, share: Tensor) -> Tensor:
+    """Force that two fingers carry over the object's weight (N,), at a depth in mm and a share of the gel in contact.
+
+    Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth and share. Above 1 they lift, as
+    about two of three do at 3 N for each mm.
+    """
+    return 2.0 * friction * (3.0 * indentation_depth * share) / weight
 
 
 def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
