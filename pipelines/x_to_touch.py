@@ -109,7 +109,7 @@ class XToTouchPipeline(UniTouchPipeline):
 
     @property
     def takes_background(self) -> bool:
-        """Whether background latents are input channels of the UNet, which so draws unnamed sensors, too."""
+        """Whether the UNet takes background latents as input channels; it then draws unnamed sensors, too."""
         return self.unet.config.in_channels != self.unet.config.out_channels
 
     # Conditions -------------------------------------------------------------------------------------------------------
