@@ -519,7 +519,7 @@ def read_scheduler(folder: Path) -> SchedulerMixin:
     kind = getattr(diffusers, name, None)
     if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return kind.from_pretrained(folder)
+    return getattr(diffusers, name).from_pretrained(folder)
 
 
 def check_unused(instead: str, **given: Any) -> None:
