@@ -40,8 +40,8 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, read_settings, reading, writing_folder
-from unitouch_gen.models.autoencoders import autoencoder_class, decode, encode, scale_factor
+from unitouch_gen.files import as_path, local_folder, reading, writing_folder
+from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
@@ -58,11 +58,9 @@ MAX_IMAGES = 100_000  # maximum per input
 MAX_SIDE = 16_384  # pixels
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
-SMALL_NETWORK = 20_000_000
-"""Parameters below which threads of a CPU wait for each other longer than they work."""
+SMALL_NETWORK = 20_000_000  # parameters; on a CPU, threads of a smaller one mostly wait for each other
 
-
-_threads: list[int] = []  # how many torch had before the first of the calls that run now, for each of these
+_threads: list[int] = []  # for each running call, how many threads torch had before the first of them
 
 
 def runs_networks(method: Method) -> Method:
@@ -120,9 +118,10 @@ class Touches:
 
 
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
-    """A latent diffusion model conditioned on embeddings of the joint space.
+    """A network conditioned on embeddings of the joint space.
 
-    Subclasses have the components `unitouch`, `processor`, `unet`, `scheduler`, `vae` and `embedding_bank`.
+    Subclasses have the components `unitouch`, `processor` and `embedding_bank`; those that make images also have
+    `unet`, `scheduler` and `vae`.
     """
 
     _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
@@ -133,14 +132,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _card: Card | Path | None = None  # or the folder with the card
 
     def _finish_init(self, network: str, **defaults: float) -> None:
-        """Stores defaults in the config, and checks the widths of embeddings."""
+        """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
         self._check_widths(network)
 
     def _check_widths(self, network: str) -> None:
-        """Raises if the embeddings of a part have another width than a network takes."""
+        """Raises if the joint space or the bank has embeddings of another width than the network takes."""
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
             "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
@@ -195,9 +194,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if latents is not None:
             check_tensor("latents", latents, *shape)
         if isinstance(generator, list) and len(generator) != batch_size:
-            raise InvalidInputError(
-                f"`generator` is a list of {len(generator)} for {batch_size} pictures; pass one, or one for each."
-            )
+            raise InvalidInputError(f"`generator` has {len(generator)} for {batch_size} images; pass one, or one each.")
         for one in generator if isinstance(generator, list) else [generator] * (generator is not None):
             check_kind("generator", one, torch.Generator)
         return shape
@@ -280,15 +277,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     # From conditioning to pictures ------------------------------------------------------------------------------------
 
     def _denoise(
-        self,
-        settings: CallSettings,
-        hidden_states: Tensor,
-        class_labels: Tensor | None,
-        report: RunReport,
-        init: Tensor | None = None,
-        extra_channels: Tensor | None = None,
+        self, settings: CallSettings, hidden_states: Tensor, class_labels: Tensor | None, report: RunReport,
+        init: Tensor | None = None, extra_channels: Tensor | None = None,
         wrap: Callable[[Network], Network] | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Noise -> latents (B n, C, h, w) in float32.
 
         Args:
@@ -402,9 +394,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         kwargs.setdefault(key, torch.float32)
         if not isinstance(kwargs[key], dict):  # dict: dtypes by component
             kwargs[key] = check_dtype(key, kwargs[key])
-        folder = local_folder(
-            name, pretrained_model_name_or_path, **kwargs
-        )  # diffusers' download cannot resolve our components
+        # diffusers' download cannot resolve our components.
+        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
             conditioning = ("embedding_bank", "backgrounds", "image_normalizer", "language_bridge")
@@ -520,11 +511,6 @@ def check_filled(folder: Path, network: Any) -> None:
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."
         )
-
-
-def autoencoder_in(folder: Path) -> Any:
-    """The class of a stored autoencoder."""
-    return autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
 
 
 def read_scheduler(folder: Path) -> SchedulerMixin:

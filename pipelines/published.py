@@ -1,4 +1,4 @@
-"""Reads published weights: a converted joint space, an unCLIP pipeline, a latent diffusion model of touch."""
+"""Reads published weights: a converted joint space and an unCLIP pipeline."""
 
 import math
 import os
@@ -17,7 +17,7 @@ from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.base import check_filled
 
-SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options; `revision` belongs to one repository
+SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options of both; `revision` is of the unCLIP
 
 
 def read_joint(
@@ -51,16 +51,14 @@ def read_unclip(
         )
     files: dict[str, Any] = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
     with reading("unclip", folder):
-        source = StableUnCLIPImg2ImgPipeline.from_pretrained(
-            folder, **files, feature_extractor=None, image_encoder=None
-        )
+        pipe = StableUnCLIPImg2ImgPipeline.from_pretrained(folder, **files, feature_extractor=None, image_encoder=None)
         for part in ("unet", "vae"):
-            check_filled(folder / part, getattr(source, part))
+            check_filled(folder / part, getattr(pipe, part))
         if not own and (folder / "image_encoder").is_dir():
             encoder = CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder", **files)
             model.vision_model = encoder
             model.config.vision_config = encoder.config
-    return source
+    return pipe
 
 
 def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:

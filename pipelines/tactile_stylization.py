@@ -155,9 +155,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
         )  # fmt: skip
-        prompts = self._check_prompts(
-            batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        )
+        positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
+        prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
 
         # 2. Encode photos and touches, and mix their embeddings
         report = RunReport()

@@ -14,7 +14,8 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import as_path, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
-from unitouch_gen.pipelines.base import UniTouchPipeline, autoencoder_in, check_filled, read_scheduler
+from unitouch_gen.models.autoencoders import stored_class
+from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled, read_scheduler
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
@@ -58,11 +59,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
     with reading("family", family):
         joint, processor = joint_space(family, dtype)
-        parts: dict[str, Any] = {
-            "unitouch": joint,
-            "processor": processor,
-            **read_settings("family", folder / "defaults.json"),
-        }
+        parts: dict[str, Any] = {"unitouch": joint, "processor": processor}
+        parts |= read_settings("family", folder / "defaults.json")
         if (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
         if kind is TouchToTextPipeline:
@@ -72,7 +70,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             parts["tokenizer"] = AutoTokenizer.from_pretrained(language)
         else:
             vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
-            parts["vae"] = stored(autoencoder_in(vae), vae)
+            parts["vae"] = stored(stored_class(vae), vae)
             parts["unet"] = stored(UNet2DConditionModel, folder / "unet")
             parts["scheduler"] = read_scheduler(folder / "scheduler")
         if kind is XToTouchPipeline and (folder / "backgrounds").is_dir():

@@ -75,45 +75,26 @@ class TouchToImagePipeline(UniTouchPipeline):
     _example_call = 'pipe(example("brick"))'
 
     def __init__(
-        self,
-        image_normalizer: StableUnCLIPImageNormalizer,
-        image_noising_scheduler: KarrasDiffusionSchedulers,
-        unet: UNet2DConditionModel,
-        scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny,
-        unitouch: UniTouchModel | None = None,
-        processor: UniTouchProcessor | None = None,
-        tokenizer: CLIPTokenizer | None = None,
-        text_encoder: CLIPTextModel | None = None,
-        embedding_bank: EmbeddingBank | None = None,
-        default_strength: float = 0.75,
-        default_guidance_scale: float = 9.0,
-        default_num_inference_steps: int = 50,
-        default_noise_level: int = 0,
-    ):
+        self, image_normalizer: StableUnCLIPImageNormalizer, image_noising_scheduler: KarrasDiffusionSchedulers,
+        unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers, vae: AutoencoderKL | AutoencoderTiny,
+        unitouch: UniTouchModel | None = None, processor: UniTouchProcessor | None = None,
+        tokenizer: CLIPTokenizer | None = None, text_encoder: CLIPTextModel | None = None,
+        embedding_bank: EmbeddingBank | None = None, default_strength: float = 0.75,
+        default_guidance_scale: float = 9.0, default_num_inference_steps: int = 50, default_noise_level: int = 0,
+    ):  # fmt: skip
         super().__init__()
         self.register_modules(
-            unitouch=unitouch,
-            processor=processor,
-            image_normalizer=image_normalizer,
-            image_noising_scheduler=image_noising_scheduler,
-            tokenizer=tokenizer,
-            text_encoder=text_encoder,
-            embedding_bank=embedding_bank,
-            unet=unet,
-            scheduler=scheduler,
-            vae=vae,
-        )
+            unitouch=unitouch, processor=processor, image_normalizer=image_normalizer,
+            image_noising_scheduler=image_noising_scheduler, tokenizer=tokenizer, text_encoder=text_encoder,
+            embedding_bank=embedding_bank, unet=unet, scheduler=scheduler, vae=vae,
+        )  # fmt: skip
         width, labels = self.embedding_dim, unet.config.projection_class_embeddings_input_dim
         if labels != 2 * width:
             raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
         self._finish_init(
-            "the unCLIP model",
-            default_strength=default_strength,
-            default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps,
-            default_noise_level=default_noise_level,
-        )
+            "the unCLIP model", default_strength=default_strength, default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps, default_noise_level=default_noise_level,
+        )  # fmt: skip
 
     @property
     def embedding_dim(self) -> int:
@@ -213,9 +194,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
         )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
-        prompts = self._check_prompts(
-            batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        )
+        positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
+        prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
 
         # 2. Encode the touch
         report = RunReport()
@@ -234,15 +214,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds, encoded=encoded)
 
     def _generate(
-        self,
-        settings: CallSettings,
-        embeds: Tensor,
-        noise_level: int,
-        prompts: list[list[str] | Tensor],
-        report: RunReport,
-        init: Tensor | None = None,
-        wrap: Callable[[Network], Network] | None = None,
-    ) -> Any:
+        self, settings: CallSettings, embeds: Tensor, noise_level: int, prompts: list[list[str] | Tensor],
+        report: RunReport, init: Tensor | None = None, wrap: Callable[[Network], Network] | None = None,
+    ) -> Any:  # fmt: skip
         """Generates pictures from un-noised embeddings (B, D); see `_check_prompts` and `_denoise`."""
         # 1. Encode the prompts
         with report.stage("prompt"):
@@ -268,13 +242,9 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     @runs_networks
     def encode_touch(
-        self,
-        touch: ImageInput,
-        sensor: SensorNames = None,
-        strength: float | None = None,
-        background: ImageInput = None,
-        bridge: bool | None = None,
-    ) -> Tensor:
+        self, touch: ImageInput, sensor: SensorNames = None, strength: float | None = None,
+        background: ImageInput = None, bridge: bool | None = None,
+    ) -> Tensor:  # fmt: skip
         """Un-noised embeddings (B, D) that condition the network; for arguments and errors see `__call__`."""
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
@@ -404,15 +374,10 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     @classmethod
     def from_published(
-        cls,
-        unclip: str | os.PathLike,
-        unitouch: str | os.PathLike | UniTouchModel,
-        *,
-        embedding_norm: float | None = None,
-        dtype: torch.dtype = torch.float32,
-        variant: str | None = None,
+        cls, unclip: str | os.PathLike, unitouch: str | os.PathLike | UniTouchModel, *,
+        embedding_norm: float | None = None, dtype: torch.dtype = torch.float32, variant: str | None = None,
         **hub: Any,
-    ) -> Self:
+    ) -> Self:  # fmt: skip
         """Builds on published weights: an unCLIP model and a converted joint space.
 
         Args:

@@ -71,34 +71,23 @@ class XToTouchPipeline(UniTouchPipeline):
     _lora_loadable_modules = ["unet"]
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny | VQModel,
-        unitouch: UniTouchModel | None = None,
-        processor: UniTouchProcessor | None = None,
-        embedding_bank: EmbeddingBank | None = None,
+        self, unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderTiny | VQModel, unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None, embedding_bank: EmbeddingBank | None = None,
         backgrounds: SensorBackgrounds | None = None,
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of other annotations
-        default_guidance_scale: float = 7.5,
-        default_num_inference_steps: int = 200,
-    ):
+        default_guidance_scale: float = 7.5, default_num_inference_steps: int = 200,
+    ):  # fmt: skip
         super().__init__()
         self.register_modules(
-            unitouch=unitouch,
-            processor=processor,
-            embedding_bank=embedding_bank,
-            backgrounds=backgrounds,
-            unet=unet,
-            scheduler=scheduler,
-            vae=vae,
-        )
+            unitouch=unitouch, processor=processor, embedding_bank=embedding_bank, backgrounds=backgrounds, unet=unet,
+            scheduler=scheduler, vae=vae,
+        )  # fmt: skip
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
-            "`unet`",
-            default_guidance_scale=default_guidance_scale,
+            "`unet`", default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
-        )
+        )  # fmt: skip
         self._check_parts()
 
     def _check_parts(self) -> None:
@@ -120,23 +109,17 @@ class XToTouchPipeline(UniTouchPipeline):
 
     @property
     def takes_background(self) -> bool:
-        """Whether background latents are input channels of the UNet, which so draws unnamed sensors, too."""
+        """Whether the UNet takes background latents as input channels; it then draws unnamed sensors, too."""
         return self.unet.config.in_channels != self.unet.config.out_channels
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
     @runs_networks
     def encode_condition(
-        self,
-        image: ImageInput = None,
-        text: str | list[str] | None = None,
-        audio: AudioInput = None,
-        touch: ImageInput = None,
-        *,
-        weights: Mapping[str, float] | None = None,
-        bridge: bool | None = None,
+        self, image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,
+        touch: ImageInput = None, *, weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         source_sensor: SensorNames = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
@@ -264,10 +247,7 @@ class XToTouchPipeline(UniTouchPipeline):
     # Checks -----------------------------------------------------------------------------------------------------------
 
     def _prepare(
-        self,
-        given: Mapping[str, Any],
-        weights: Mapping[str, float] | None,
-        source_sensor: SensorNames,
+        self, given: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
     ) -> tuple[Conditions, int]:
         """Reads the given modalities; also returns the number of inputs, B."""
         given = {name: value for name, value in given.items() if value is not None}

@@ -78,12 +78,9 @@ def augmented(raw: Tensor) -> Tensor:
 
 
 def adapt(
-    model: UniTouchModel,
-    name: str,
-    touches: np.ndarray,
-    images: np.ndarray | None = None,
+    model: UniTouchModel, name: str, touches: np.ndarray, images: np.ndarray | None = None,
     config: AdaptConfig | None = None,
-) -> AddedSensor:
+) -> AddedSensor:  # fmt: skip
     """Learns a sensor from its touches.
 
     Args:

@@ -63,13 +63,9 @@ class InBatchSampler:
     """
 
     def __init__(
-        self,
-        sizes: Sequence[int],
-        batch_size: int,
-        settings: SamplerSettings,
-        seed: int = 0,
+        self, sizes: Sequence[int], batch_size: int, settings: SamplerSettings, seed: int = 0,
         near: np.ndarray | None = None,
-    ):
+    ):  # fmt: skip
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
         self.near, self.group = near, settings.group
         self.share = share_of(settings.sigma, batch_size, len(sizes))

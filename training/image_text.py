@@ -1,9 +1,9 @@
 """Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
 
-Drawn contacts can be seen under two lamps, whose pictures are told from those of contacts like them, as SimCLR does
-(Chen et al., 2020): captions do not say which contact it is, and a touch is to be bound to its own picture.
+Pictures of a drawn contact under two lamps can be bound to each other, as SimCLR binds views of an image (Chen et al.,
+2020). Captions do not say which contact a picture shows, and touches are bound to single pictures later.
 
-With `--init` it goes on from the encoders, tokenizer and sizes of a joint space, whatever the recipe says of these.
+`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's.
 
 python -m unitouch_gen.training.image_text --output runs/image_text
 """
@@ -76,8 +76,8 @@ class ImageTextObjective(nn.Module):
         if self.reader is not None:
             parts["attributes"] = F.mse_loss(self.reader(image.float()), batch["attributes"])
         loss = torch.stack([getattr(self.settings, name, 1.0) * part for name, part in parts.items()]).sum()
-        told = {"temperature": temperature, **parts}
-        return {"loss": loss, **{name: value.detach() for name, value in told.items()}}
+        logged = {"temperature": temperature, **parts}
+        return {"loss": loss, **{name: value.detach() for name, value in logged.items()}}
 
 
 def recoloured(pictures: Tensor) -> Tensor:
@@ -97,12 +97,6 @@ def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -
         else:
             captions += [[caption] * count for caption in split.text]
     return captions
-
-
-def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
-    """Pictures under another lamp."""
-    pairs = zip(stage.sources, splits, strict=True)
-    return [relit(stage.cache, source, "train", split) for source, split in pairs]  # type: ignore[arg-type]
 
 
 def main(stage: Stage) -> None:
@@ -126,7 +120,8 @@ def main(stage: Stage) -> None:
         data["attributes"] = in_deviations(np.asarray(columns(splits, "image", SHOWN["image"]).columns["attributes"]))
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.views:
-        data["relit"] = relit_of(stage, splits)
+        pairs = zip(stage.sources, splits, strict=True)
+        data["relit"] = [relit(stage.cache, source, "train", split) for source, split in pairs]  # type: ignore[arg-type]
     sampler = None
     if recipe.sampler.group > 1:
         sampler = stage.sampler(recipe.sampler, splits, stage.image_embeddings(model, splits))

@@ -18,7 +18,6 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_settings
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
@@ -99,12 +98,6 @@ def make_autoencoder(model: Arguments) -> Autoencoder:
     """The autoencoder of a recipe's `model`."""
     kind = autoencoder_class("model.class", model.get("class"))
     return build("model", kind, {key: value for key, value in model.items() if key != "class"})
-
-
-def read_autoencoder(folder: Path) -> Autoencoder:
-    """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
-    kind = autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
-    return kind.from_pretrained(folder, use_safetensors=True).eval().requires_grad_(False)
 
 
 def main(stage: Stage, modality: str = "image") -> None:

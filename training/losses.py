@@ -39,13 +39,9 @@ def gathered(rows: Tensor) -> Tensor:
 
 
 def denoising_losses(
-    unet: UNet2DConditionModel,
-    scheduler: DDPMScheduler,
-    latents: Tensor,
-    snr_gamma: float,
-    extra_channels: Tensor | None = None,
-    **conditions: Tensor,
-) -> dict[str, Tensor]:
+    unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, snr_gamma: float,
+    extra_channels: Tensor | None = None, **conditions: Tensor,
+) -> dict[str, Tensor]:  # fmt: skip
     """Mean squared error of the network's prediction at random steps, weighted by their signal-to-noise ratios (SNR).
 
     The weight of the error in x0 is the SNR, at most `snr_gamma` (min-SNR; Hang et al., 2023) and of a network that

@@ -160,10 +160,7 @@ class Stage:
             raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
 
     def fit(
-        self,
-        objective: nn.Module,
-        dataset: ArrayDataset,
-        indices_of: Callable[[int], Sequence[int]] | None = None,
+        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]] | None = None
     ) -> None:
         """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:
@@ -178,7 +175,7 @@ class Stage:
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
-        """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
+        """The folder to write the stage's model to; `record.json` beside it has seed, recipe, inputs and times."""
         record: dict[str, Any] = {
             "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
             "inputs": self.inputs, "trainer": self.trainer.model_dump(),

@@ -38,7 +38,7 @@ class SensorSettings(Settings):
 
 
 class LossWeights(Settings):
-    """Weights of the paper's loss, of one that places what that orders, and of three that drawn sensors allow."""
+    """Weights of losses: the paper's, the distance of a touch to its picture, and three that need drawn contacts."""
 
     image: NonNegativeFloat = 1.0  # InfoNCE of touches and their pictures (Eq. 2-3)
     # 1 - cosine(touch, picture). InfoNCE asks only that others are further, and leaves touches far from all pictures
@@ -155,8 +155,8 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
 def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training.
 
-    With `reaches`, also the distance that all but a few of these are within. An encoder that has seen touches without
-    tokens can do without them beyond it.
+    With `reaches`, also the distance that nearly all of these are within. Touches beyond it get no tokens, so the
+    encoder has to be trained without tokens, too.
     """
     model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:

@@ -22,11 +22,12 @@ from torch import Tensor, nn
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, sensor_numbers
 from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP
-from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
+from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
 from unitouch_gen.training.stages import Recipe, Stage, run
@@ -60,13 +61,9 @@ class TouchDiffusionObjective(nn.Module):
     """
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: DDPMScheduler,
-        embedding_norm: float,
-        settings: TouchDiffusionSettings,
-        backgrounds: Tensor | None = None,
-    ):
+        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, embedding_norm: float,
+        settings: TouchDiffusionSettings, backgrounds: Tensor | None = None,
+    ):  # fmt: skip
         super().__init__()
         self.trained = unet
         self.scheduler, self.embedding_norm, self.settings = scheduler, embedding_norm, settings

@@ -74,14 +74,9 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        objective: nn.Module,
-        dataset: ArrayDataset,
-        indices_of: Callable[[int], Sequence[int]],
-        config: TrainerConfig,
-        output: Path,
-        progress: Mapping[str, Any] | None = None,
-    ):
+        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]],
+        config: TrainerConfig, output: Path, progress: Mapping[str, Any] | None = None,
+    ):  # fmt: skip
         self.config, self.output, self.progress = config, output, dict(progress or {})
         self.dataset, self.indices_of = dataset, indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
@@ -213,7 +208,7 @@ def checkpoints_in(output: Path) -> list[Path]:
 
 
 def read_progress(output: Path) -> dict[str, Any]:
-    """What a run's last checkpoint holds beside its state: `step`, `seconds`, and what the trainer was given."""
+    """The progress of a run's last checkpoint: `step`, `seconds`, and what `Trainer` was passed as `progress`."""
     if found := checkpoints_in(output):
         return read_settings("resume", found[-1] / "progress.json")
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")

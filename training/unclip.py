@@ -16,8 +16,9 @@ from torch import Tensor, nn
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
+from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
 from unitouch_gen.training.stages import Recipe, Stage, run
@@ -53,16 +54,10 @@ class UnclipObjective(nn.Module):
     """
 
     def __init__(
-        self,
-        unet: UNet2DConditionModel,
-        scheduler: DDPMScheduler,
-        settings: UnclipSettings,
-        normalizer: StableUnCLIPImageNormalizer,
-        noising: DDPMScheduler,
-        captions: list[str],
-        processor: UniTouchProcessor,
-        text_encoder: nn.Module,
-    ):
+        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, settings: UnclipSettings,
+        normalizer: StableUnCLIPImageNormalizer, noising: DDPMScheduler, captions: list[str],
+        processor: UniTouchProcessor, text_encoder: nn.Module,
+    ):  # fmt: skip
         super().__init__()
         self.trained, self.scheduler, self.settings = unet, scheduler, settings
         self.frozen = (normalizer, text_encoder.eval())  # in a tuple, so that they are no modules of the objective

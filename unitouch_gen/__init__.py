@@ -33,21 +33,6 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "errors": ("InvalidInputError", "InvalidTypeError", "NonFiniteError"),
-    "examples": ("example",),
-    "models": (
-        "LanguageBridge",
-        "SensorBank",
-        "StemmedCLIPVisionModel",
-        "UniTouchConfig",
-        "UniTouchModel",
-        "UniTouchProcessor",
-    ),
-    "pipelines.tiny": ("tiny",),
-}
-"""Modules of names; the others are of `pipelines`."""
-
 __all__ = [
     "InvalidInputError", "InvalidTypeError", "LanguageBridge", "NonFiniteError", "SensorBank",
     "StemmedCLIPVisionModel", "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline",
@@ -55,12 +40,14 @@ __all__ = [
     "XToTouchPipeline", "example", "tiny",
 ]  # fmt: skip
 
+_MODULES = ("errors", "examples", "models", "pipelines.tiny", "pipelines")  # what imports least comes first
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = next((module for module, names in _HOMES.items() if name in names), "pipelines")
-    return getattr(import_module(f"{__name__}.{home}"), name)
+    modules = (import_module(f"{__name__}.{module}") for module in _MODULES)
+    return next(getattr(module, name) for module in modules if hasattr(module, name))
 
 
 def __dir__() -> list[str]:

@@ -29,12 +29,9 @@ def match_norm(embeds: Tensor, norm: float) -> Tensor:
 
 
 def noise_embeddings(
-    embeds: Tensor,
-    noise_level: Tensor,
-    noise: Tensor,
-    normalizer: StableUnCLIPImageNormalizer,
+    embeds: Tensor, noise_level: Tensor, noise: Tensor, normalizer: StableUnCLIPImageNormalizer,
     scheduler: SchedulerMixin,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Noised embeddings with their noise level: the class labels of an unCLIP UNet.
 
     c = [ unscale(sqrt(abar_l) scale(e) + sqrt(1 - abar_l) n) | sinusoid(l) ], as in

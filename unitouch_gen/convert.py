@@ -120,12 +120,9 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
 
 
 def read_published(
-    touch: str | os.PathLike | None = None,
-    imagebind: str | os.PathLike | None = None,
-    *,
-    config: UniTouchConfig | None = None,
-    dtype: torch.dtype | None = None,
-) -> UniTouchModel:
+    touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None, *,
+    config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
+) -> UniTouchModel:  # fmt: skip
     """A joint space of the published checkpoints.
 
     Args:
@@ -135,16 +132,14 @@ def read_published(
         dtype: Precision of the weights; the file's own when left out.
 
     Raises:
-        InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
-            finite.
+        InvalidInputError: If neither file is given, or one is none of these, lacks tensors, or holds some that are
+            not finite.
     """
     config = UniTouchConfig() if config is None else copy.deepcopy(check_kind("config", config, UniTouchConfig))
     if touch is None and imagebind is None:
         raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
     if config.sensors:
-        raise InvalidInputError(
-            "`config` names sensors, and the published files have no tokens of any; leave them out."
-        )
+        raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
     wanted = None if dtype is None else check_dtype("dtype", dtype)
     model: Any = UniTouchModel(config, modalities=()).eval()
     for name, path in (("imagebind", imagebind), ("touch", touch)):
@@ -208,7 +203,7 @@ LEFT_BY_TRAINERS: list[Any] = [
 
 
 def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
-    """The weights in a checkpoint, which came in an argument of some name.
+    """The weights in a checkpoint, whose path was passed as the argument `name`.
 
     It is a pickle of `torch.save`, also of a dict with the weights as "state_dict" or "model", or safetensors. A pickle
     is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the format
@@ -252,14 +247,9 @@ def read_config(name: str, file: Path) -> UniTouchConfig:
 
 
 def convert_published(
-    output: str | os.PathLike,
-    *,
-    touch: str | os.PathLike | None = None,
-    imagebind: str | os.PathLike | None = None,
-    tokenizer: str | os.PathLike | None = None,
-    config: UniTouchConfig | None = None,
-    dtype: torch.dtype | None = None,
-) -> list[str]:
+    output: str | os.PathLike, *, touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None,
+    tokenizer: str | os.PathLike | None = None, config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
+) -> list[str]:  # fmt: skip
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
     Args:

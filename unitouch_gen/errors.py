@@ -1,4 +1,4 @@
-"""Error types, and the checks of arguments, each of which returns what came.
+"""Error types, and the checks of arguments, each of which returns the checked value.
 
 A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used an `InvalidInputError`; the message
 names the argument, what came, and what to do.
@@ -39,7 +39,7 @@ class UnfamiliarInputWarning(UserWarning):
 
 
 def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
-    """Runs a typer application of some name, with a command line in place of that of the process.
+    """Runs a typer application under a name; `words` are a command line in place of the process's own.
 
     A user's mistake is one line on standard error and exit code 2, a warning of ours one line.
     """

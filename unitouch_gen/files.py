@@ -30,7 +30,7 @@ _LOADING = threading.RLock()  # libraries patch torch in all threads while they 
 def _hidden_beside(
     name: str, target: Path, kind: Callable[[Path], bool] = os.path.isfile, folder: Path | None = None
 ) -> Iterator[Path]:
-    """A hidden folder beside a target, or in `folder`; errors of writing name the argument that the target came in."""
+    """A hidden folder beside a target, or in `folder`; errors of writing name the argument that named the target."""
     folder = folder or target.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,7 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
 
 
 def as_path(name: str, place: Any) -> Path:
-    """A path that came in the argument `name`, with `~` as the home folder."""
+    """The path passed as the argument `name`, with `~` as the home folder."""
     if not str(check_kind(name, place, str, os.PathLike)) or "\0" in str(place):
         raise InvalidInputError(f"`{name}` is {describe(str(place))}; it has to be the path of a file or folder.")
     return Path(place).expanduser()

@@ -49,10 +49,7 @@ class ReturnCode(StrEnum):
     SUCCESS = "success", "The sample is finite."
     NON_FINITE = "non_finite", "Not finite. Lower `guidance_scale` or `strength`, take more steps, or run in float32."
     DIVERGED = "diverged", "Far larger than the latents of pictures. Lower `guidance_scale`, or take more steps."
-    MAX_EVALUATIONS = (
-        "max_evaluations",
-        "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`.",
-    )
+    MAX_EVALUATIONS = "max_evaluations", "Unfinished. Allow more `max_evaluations`, or a larger `tolerance`."
     INTERRUPTED = "interrupted", "Interrupted, with noise left in the sample. Call again to finish it."
 
     @property
@@ -128,16 +125,10 @@ class Steps:
 
 
 def prepare_steps(
-    scheduler: SchedulerMixin,
-    *,
-    solver: str | None = None,
-    num_inference_steps: int | None = None,
-    tolerance: float | None = None,
-    max_evaluations: int | None = None,
-    eta: float = 0.0,
-    init_strength: float = 1.0,
+    scheduler: SchedulerMixin, *, solver: str | None = None, num_inference_steps: int | None = None,
+    tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0, init_strength: float = 1.0,
     device: torch.device | str = "cpu",
-) -> Steps:
+) -> Steps:  # fmt: skip
     """Validates the step arguments of a call, before any network runs.
 
     `num_inference_steps` (default 50) or `tolerance`, a relative RMS error of the latents from 1e-5 to 1, sets the
@@ -152,9 +143,7 @@ def prepare_steps(
     check_number("init_strength", init_strength, 0.0, 1.0)
     if tolerance is None:
         if max_evaluations is not None:
-            raise InvalidInputError(
-                f"`max_evaluations` is {describe(max_evaluations)}, but needs a `tolerance`; leave it out."
-            )
+            raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
         levels = config.get("num_train_timesteps", 1000)
         whole = 50 if num_inference_steps is None else num_inference_steps
         count = max(round(init_strength * check_integer("num_inference_steps", whole, 1, levels)), 1)
@@ -168,9 +157,7 @@ def prepare_steps(
         return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
     for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
         if value is not None:
-            raise InvalidInputError(
-                f"`{name}` is {describe(value)}, but `tolerance` was given, which sets the steps; leave one out."
-            )
+            raise InvalidInputError(f"`{name}` is {describe(value)}, but `tolerance` sets the steps; leave one out.")
     check_number("tolerance", tolerance, 1e-5, 1.0)
     limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
     start = schedule.karras_level(1.0 - init_strength)
@@ -253,18 +240,10 @@ class _EndedError(Exception):
 
 @torch.no_grad()
 def sample(
-    network: Network,
-    noise: Tensor,
-    steps: Steps,
-    report: RunReport,
-    *,
-    guidance: Guidance = Guidance(1.0),
-    init: Tensor | None = None,
-    generator: Any = None,
-    throw: bool = True,
-    on_step: OnStep | None = None,
+    network: Network, noise: Tensor, steps: Steps, report: RunReport, *, guidance: Guidance = Guidance(1.0),
+    init: Tensor | None = None, generator: Any = None, throw: bool = True, on_step: OnStep | None = None,
     progress: Callable[[float], object] = lambda share: None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """From noise to latents, float32 (B, C, h, w). Non-finite samples are returned as zeros.
 
     Args:

@@ -31,13 +31,9 @@ def unchanged(step: int, x: Tensor, sigma: float) -> Tensor:
 
 
 def sample_ddim(
-    denoise: Denoise,
-    x: Tensor,
-    sigmas: Sequence[float],
-    after_step: AfterStep = unchanged,
-    eta: float = 0.0,
+    denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged, eta: float = 0.0,
     draw: Callable[[Tensor], Tensor] = torch.randn_like,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """DDIM, of order 1; at eta = 1 it adds as much noise as DDPM (Song et al., 2021, Equations 12 and 16).
 
     At eta = 0 it is the method of Euler.
@@ -154,13 +150,9 @@ def denoised_at_zero(levels: Levels) -> Tensor:
 
 
 def sample_adaptive(
-    denoise: Denoise,
-    x: Tensor,
-    ends: tuple[float, float],
-    tolerance: float,
-    after_step: AfterStep,
+    denoise: Denoise, x: Tensor, ends: tuple[float, float], tolerance: float, after_step: AfterStep,
     active: Callable[[], Sequence[bool]],
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Adaptive steps from the first to the second of two sigmas, for a relative RMS tolerance of the result.
 
     A predictor of order 2 and a corrector of order 3 are an embedded pair: their difference is the local error. A step

@@ -74,10 +74,10 @@ BAD = {
         ("app --model in", "`--model` names 'in/model_index.json'"),
     ],
     "combinations": [
-        (TO_TOUCH, "Nothing to make a touch of came"),
+        (TO_TOUCH, "No input was given"),
         (f"{TO_TOUCH} --text brick --sensor digit --background in/dark.png", "`background` was given"),
         (f"{TO_TOUCH} --text brick --source-sensor digit", "`source_sensor` has no effect"),
-        (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` came 2 times, another 3 times"),
+        (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` was given 2 times, another 3"),
         (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
         (f"{TO_IMAGE} --tolerance 0.1 --steps 5", "`tolerance`"),
         ("convert unitouch -o out", "pass `--touch`, `--imagebind` or both"),

@@ -3,7 +3,7 @@
 import torch
 
 from unitouch_gen.world import World
-from unitouch_gen.world.grasps import grasp_margin
+from unitouch_gen.world.scene import grasp_margin
 
 
 def test_a_grasp_holds_by_coulombs_law_and_two_of_three_do() -> None:

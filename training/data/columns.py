@@ -56,9 +56,7 @@ class DataConfig(Settings):
     def sources(self) -> list[Source]:
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
         if self.drawn is None and not self.sets:
-            raise InvalidInputError(
-                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts."
-            )
+            raise InvalidInputError("`data` names nothing to learn; give it `sets`, as [{path: FOLDER}], or `drawn`.")
         drawn = self.drawn.sources() if self.drawn else []
         return [*drawn, *(part for one in self.sets for part in one.read())]
 
@@ -91,12 +89,8 @@ def has(record: Record, need: str) -> bool:
 
 
 def columns_of(
-    sources: Sequence[Source],
-    cache: Path,
-    config: DataConfig,
-    processor: UniTouchProcessor,
-    needs: Sequence[str],
-) -> list[Rendered]:
+    sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str],
+) -> list[Rendered]:  # fmt: skip
     """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
     `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
@@ -145,9 +139,7 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
 
     arrays: Any = mapped(folder, len(material), columns, write)
     if json.loads((folder / "settings.json").read_text()) != settings:
-        raise InvalidInputError(
-            f"`cache` holds {str(folder)!r} with other settings of sounds; delete it, or name another."
-        )
+        raise InvalidInputError(f"`cache` holds {str(folder)!r} with other settings of sounds; delete it.")
     text = json.loads((folder / "text.json").read_text())
     return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
 
@@ -166,13 +158,9 @@ def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.
 
 
 def decoded(
-    cache: Path,
-    data: RecordSet,
-    processor: UniTouchProcessor,
-    needs: Sequence[str],
-    materials: Sequence[str] = (),
+    cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], materials: Sequence[str] = (),
     touch_size: int | None = None,
-) -> Rendered:
+) -> Rendered:  # fmt: skip
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
     Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave
@@ -191,8 +179,8 @@ def decoded(
     }
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
-    told = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
-    fingerprint = hashlib.sha256(told.encode()).hexdigest()[:16]
+    state = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
+    fingerprint = hashlib.sha256(state.encode()).hexdigest()[:16]
     columns: dict[str, Any] = dict.fromkeys(kinds)
     for name, (read, (dtype, *shape)) in kinds.items():
         if name in needs:

@@ -36,7 +36,7 @@ class Relit(World):
 
 @dataclass(frozen=True)
 class DrawnContacts:
-    """What is to be rendered for one sensor, the first of each pair, or for none but drawn ones; see `DrawnConfig`.
+    """What to render for one sensor: the first of each pair, or `None` where both are drawn anew; see `DrawnConfig`.
 
     Objects are numbered from `number` thousands, so that no two sources share one.
     """

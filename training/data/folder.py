@@ -52,9 +52,7 @@ def read_rows(folder: Path, table: Path) -> Iterator[Record]:
         known |= {name: str(folder / row[column]) for name, column in columns.items() if row[column]}
         known |= {name: Frame(known[name]) for name in FRAMES if name in known}
         if known.get("split") not in (None, *SPLITS):
-            raise InvalidInputError(
-                f"{str(table)!r} names the split {known['split']!r}; there are {', '.join(SPLITS)}."
-            )
+            raise InvalidInputError(f"{str(table)!r} has the split {known['split']!r}; there are {', '.join(SPLITS)}.")
         yield Record(**known, labels={label: row[label] for label in labels if row[label] not in ("", "-1")})
 
 

@@ -58,12 +58,12 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     seen = decoded(cache, data, processor, ["touch", *gel, *modalities], data.materials)
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
-    told = {"caption": list(seen.text)} if "text" in modalities else {}
+    known = {"caption": list(seen.text)} if "text" in modalities else {}
     if "material" in labels and bool((labels["material"] >= 0).all()):
-        told["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
+        known["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
     asked = [
-        {topic: (QUESTIONS[topic][0], [answers[row]]) for topic, answers in told.items()}
-        for row in range(len(data) if told else 0)
+        {topic: (QUESTIONS[topic][0], [answers[row]]) for topic, answers in known.items()}
+        for row in range(len(data) if known else 0)
     ]
     return Contacts(
         seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
@@ -100,15 +100,9 @@ Sets = Iterator[tuple[str, bool, int, Splits]]
 
 
 def of_world(
-    cache: Path,
-    model: UniTouchModel,
-    processor: UniTouchProcessor,
-    sensors: Sequence[str],
-    seeds: Sequence[int],
-    objects: int,
-    *,
-    grasps: bool = False,
-) -> Sets:
+    cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sensors: Sequence[str], seeds: Sequence[int],
+    objects: int, *, grasps: bool = False,
+) -> Sets:  # fmt: skip
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
     for seed, sensor in product(seeds, (*sensors, None)):
         source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects)

@@ -33,7 +33,7 @@ class Frame:
         source: Any = self.path
         try:
             if self.index is not None:
-                source = open_video(self.path).frame(self.index)
+                source = open_video(self.path, threading.get_ident()).frame(self.index)
             elif self.key is not None:
                 with needed("h5py").File(self.path) as file:
                     source = file[self.key][()]
@@ -95,13 +95,9 @@ def column_of(file: Path, columns: Iterable[str], known: Sequence[str]) -> str:
 
 
 @lru_cache(maxsize=64)  # two for each thread, as a recording has two
-def _opened(path: str, thread: int) -> "Video":
+def open_video(path: str, thread: int) -> "Video":
+    """A video that is read in one thread alone."""
     return Video(path)
-
-
-def open_video(path: str) -> "Video":
-    """A video that no other thread reads."""
-    return _opened(path, threading.get_ident())
 
 
 class Video:

@@ -110,13 +110,9 @@ class RecordSet:
 
 
 def open_dataset(
-    path: str | Path,
-    kind: str = "auto",
-    *,
-    sensor: str | None = None,
-    materials: Sequence[str] | None = None,
+    path: str | Path, kind: str = "auto", *, sensor: str | None = None, materials: Sequence[str] | None = None,
     sampling_rate: int | None = None,
-) -> RecordSet:
+) -> RecordSet:  # fmt: skip
     """Lists the records of a data set in the layout it was published in, or of a folder of one's own.
 
     No image is read.

@@ -35,9 +35,7 @@ def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
     """The frames of one sensor's contact."""
     touches, pictures = ([Frame(str(image)) for image in images_in(item / f"{of}{sensor}")] for of in ("", "img_"))
     if not 0 <= start <= end < len(touches):
-        raise InvalidInputError(
-            f"A contact is from frame {start} to {end}, but {str(item / sensor)!r} has {len(touches)} images."
-        )
+        raise InvalidInputError(f"{str(item / sensor)!r} has {len(touches)} images, but contact from {start} to {end}.")
     recording, gel = f"{item.parent.name}/{item.name}/{sensor}", touches[0] if start > 0 else None
     for number in range(start, end + 1):
         picture = pictures[number * len(pictures) // len(touches)] if pictures else None

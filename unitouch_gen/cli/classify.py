@@ -14,7 +14,7 @@ def classify(
     labels: Annotated[str | None, Option(help="By comma; the world's materials if left out.")] = None,
     template: Annotated[str, Option(help="What a label is put into, at {}.")] = "this feels like {}",
     sensor: options.Sensor = None,
-    top: Annotated[int, Option(min=1, help="How many labels are told of each.")] = 3,
+    top: Annotated[int, Option(min=1, help="How many labels are printed for each.")] = 3,
     model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
     device: options.Device = "auto", as_json: options.AsJson = False,
 ) -> None:  # fmt: skip

@@ -12,7 +12,7 @@ app = Typer(no_args_is_help=True, help="Published checkpoints as folders of safe
 
 @app.command()
 def unitouch(
-    output: Annotated[Path, Option("--output", "-o", help="A folder; one with other modalities is added to.")],
+    output: Annotated[Path, Option("--output", "-o", help="A folder that holds no model yet.")],
     touch: Annotated[Path | None, Option(**FILE, help="UniTouch's last_new.ckpt, for touch.")] = None,
     imagebind: Annotated[Path | None, Option(**FILE, help="ImageBind's imagebind_huge.pth, for the others.")] = None,
     tokenizer: Annotated[Path | None, Option(exists=True, help="Folder `tokenizer` of SD 2.1 unCLIP.")] = None,
@@ -27,7 +27,7 @@ def unitouch(
     from unitouch_gen.errors import InvalidInputError, check_dtype
 
     if touch is None and imagebind is None:
-        raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
+        raise InvalidInputError("Nothing was given to convert; pass `--touch`, `--imagebind` or both.")
     sizes = None if config is None else read_config("--config", config)
     kind = None if dtype is None else check_dtype("--dtype", dtype)
     lacks = convert_published(output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind)

@@ -149,14 +149,9 @@ def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
 
 
 def figures_of(
-    names: Sequence[str],
-    sets: "Sets",
-    joint: "UniTouchModel",
-    processor: Any,
-    pipes: Mapping[str, Any],
-    each: int,
+    names: Sequence[str], sets: "Sets", joint: "UniTouchModel", processor: Any, pipes: Mapping[str, Any], each: int,
     judge: Path | None = None,
-) -> dict[str, Figures]:
+) -> dict[str, Figures]:  # fmt: skip
     """Figures of each table."""
     import torch
 

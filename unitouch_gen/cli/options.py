@@ -14,8 +14,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice
 
 SETTABLE = (
     "bridge", "eta", "guidance_scale", "height", "init_strength", "keep_colours", "layout", "max_evaluations", "mix",
-    "noise_level", "num_inference_steps", "solver", "strength", "tolerance",
-    "touch_weight", "weights", "width",
+    "noise_level", "num_inference_steps", "solver", "strength", "tolerance", "touch_weight", "weights", "width",
 )  # fmt: skip
 """Arguments of pipelines' calls that are the same for all pictures of a call."""
 

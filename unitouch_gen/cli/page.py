@@ -12,6 +12,7 @@ import torch
 from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
+from unitouch_gen.world.questions import QUESTIONS
 
 Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
@@ -66,12 +67,7 @@ def asking_tab(pipe: Any) -> None:
     with gradio.Row():
         with gradio.Column():
             touch = upload("touch", "Touch")
-            asked = [
-                "What is it made of?",
-                "How does it feel?",
-                "Where is the contact?",
-                "Which way does the grain run?",
-            ]
+            asked = [wordings[0] for topic, wordings in QUESTIONS.items() if topic != "caption"]
             question = gradio.Dropdown(asked, value=asked[1], label="Question", allow_custom_value=True)
             button = gradio.Button("Ask", variant="primary")
         with gradio.Column():
@@ -149,7 +145,7 @@ def solver_fields(pipe: Any) -> Fields:
 
 
 def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
-    """Pictures, what they feel like, the run report and the seed; what the call refuses is told in the page."""
+    """Pictures, what they feel like, the run report and the seed; errors are shown in the page."""
     given = {name: value for name, value in given.items() if value not in (None, "")}
     seed = int(given.pop("seed", random.randrange(2**31)))
     if "tolerance" in given:
@@ -171,7 +167,7 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
 
 @contextmanager
 def refusing(uploads: Iterable[str]) -> Iterator[None]:
-    """Tells in the page what a call refuses, with the names of uploads, and not where they lie here."""
+    """Shows the errors of a call in the page, with the names of uploads in place of their paths."""
     try:
         yield
     except (ValueError, TypeError, ArithmeticError) as error:

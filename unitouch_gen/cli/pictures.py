@@ -101,11 +101,11 @@ def x_to_touch(
         name: some if name == "text" else files_of(f"--{name}", some, name) for name, some in words.items() if some
     }
     if not inputs:
-        raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
+        raise InvalidInputError("No input was given; pass `--image`, `--text`, `--audio` or `--touch`.")
     most = max(map(len, inputs.values()))
     for name, values in inputs.items():
         if len(values) not in (1, most):
-            raise InvalidInputError(f"`--{name}` came {len(values)} times, another {most} times; pass one, or as many.")
+            raise InvalidInputError(f"`--{name}` was given {len(values)} times, another {most}; pass one, or as many.")
     pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **context.params)
     known = list(pipe.config.sensors)
     drawn = known if sensor and "all" in sensor else sensor or ([] if background else known[:1])
@@ -188,7 +188,7 @@ def save(image: "Image.Image", file: Path) -> None:
 
 
 def described(picture: Picture, report: "RunReport", place: int) -> dict[str, Any]:
-    """What there is to tell of a picture, the one at a place of its call, for JSON."""
+    """The row of JSON for the picture at a place of its call: file, inputs, and what the report says of the touch."""
     row: dict[str, Any] = {"picture": str(picture.file), **{name: str(value) for name, value in picture.inputs.items()}}
     if report.sensors:
         row |= {"touch_sensor": report.sensors[place], "sensor_distance": report.sensor_distances[place]}
@@ -198,7 +198,7 @@ def described(picture: Picture, report: "RunReport", place: int) -> dict[str, An
 
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
-    """Makes pictures by the options of a command, saves each when its call has ended, and prints what came of them."""
+    """Makes pictures by a command's options, saves those of each call, and prints a table of them and the report."""
     given, rows = context.params, list[dict[str, Any]]()
     reports: list[RunReport] = []
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}

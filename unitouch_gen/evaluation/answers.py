@@ -22,13 +22,13 @@ from unitouch_gen.world.captions import DIRECTION_WORDS, HARDNESS_WORDS, ROUGHNE
 Asked = Mapping[str, tuple[str, Sequence[str]]]
 """By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
 
-TOLD: dict[str, dict[str, str]] = {
+ANSWER_CLASSES: dict[str, dict[str, str]] = {
     "place": {word: word for word in ("all over", "centre", "left", "right", "above", "below")},
     "grain": {word: word for word in DIRECTION_WORDS},
     "feel": {word: "hard" if word in ("hard", "firm") else "soft" for word in HARDNESS_WORDS},
     "grasp": {"hold": "hold", "slip": "slip"},
 }
-"""By topic: words that tell answers apart, and what each stands for."""
+"""By topic: the class of answer that each word stands for."""
 
 COLUMNS = {"material": "material", "place": "contact place", "grain": "grain", "feel": "hard or soft", "grasp": "grasp"}
 
@@ -93,12 +93,11 @@ def measured(
 ) -> Figures:
     """Figures of answers by topic, each to one of the questions that were asked."""
     figures = Figures()
-    for topic, words in {"material": {name: name for name in materials}, **TOLD}.items():
+    for topic, words in {"material": {name: name for name in materials}, **ANSWER_CLASSES}.items():
         if topic not in answers:
             continue
-        pairs = [
-            (told(one[topic][1][0], words), told(text, words)) for one, text in zip(asked, answers[topic], strict=True)
-        ]
+        truths = [class_of(one[topic][1][0], words) for one in asked]
+        pairs = list(zip(truths, [class_of(text, words) for text in answers[topic]], strict=True))
         right = {true: [true == said for other, said in pairs if other == true] for true, _ in pairs if true}
         shares = [sum(found) / len(found) for found in right.values()]
         balanced = topic in ("feel", "grasp")
@@ -118,8 +117,8 @@ def measured(
     return figures
 
 
-def told(text: str, words: Mapping[str, str]) -> str | None:
-    """What the first of some words in a text stands for; `None` if there is none."""
+def class_of(text: str, words: Mapping[str, str]) -> str | None:
+    """The class that the first of some words in a text stands for; `None` if the text has none of them."""
     found = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
     return words[found[0]] if found else None
 

@@ -75,14 +75,9 @@ class ZeroShotTouchClassifier:
 
     @torch.no_grad()
     def __call__(
-        self,
-        touch: ImageInput,
-        labels: Sequence[str] = MATERIAL_NAMES,
-        template: str | None = None,
-        *,
-        sensor: str | Sequence[str | None] | None = None,
-        top: int | None = None,
-    ) -> list[Named]:
+        self, touch: ImageInput, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None, *,
+        sensor: str | Sequence[str | None] | None = None, top: int | None = None,
+    ) -> list[Named]:  # fmt: skip
         """The labels of each touch with their probabilities, best first.
 
         Args:
@@ -108,15 +103,9 @@ class ZeroShotTouchClassifier:
 
     @torch.no_grad()
     def name(
-        self,
-        features: Tensor,
-        modality: str,
-        labels: Sequence[str] = MATERIAL_NAMES,
-        template: str | None = None,
-        *,
-        top: int | None = 3,
-        unknown: Sequence[str | None] = (),
-    ) -> list[Named]:
+        self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None, *,
+        top: int | None = 3, unknown: Sequence[str | None] = (),
+    ) -> list[Named]:  # fmt: skip
         """The labels of embeddings with their probabilities, best first.
 
         Args:

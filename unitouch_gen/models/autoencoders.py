@@ -3,12 +3,14 @@
 Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G).
 """
 
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
+from unitouch_gen.files import read_settings
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderTiny | VQModel
 
@@ -18,6 +20,16 @@ CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, Autoe
 def autoencoder_class(argument: str, name: Any) -> Any:
     """The class of that name in diffusers' configurations; raises an `InvalidInputError` if there is none."""
     return CLASSES[check_choice(argument, name, CLASSES)]
+
+
+def stored_class(folder: Path) -> Any:
+    """The class of the autoencoder in a folder."""
+    return autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
+
+
+def read_autoencoder(folder: Path) -> Autoencoder:
+    """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
+    return stored_class(folder).from_pretrained(folder, use_safetensors=True).eval().requires_grad_(False)
 
 
 def scale_factor(vae: Autoencoder) -> int:

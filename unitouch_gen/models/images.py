@@ -49,9 +49,7 @@ def _load(name: str, image: Any) -> list[Tensor]:
         image = _channels_first(name, image)
     if isinstance(image, Tensor):
         return _checked(name, image.detach())
-    raise InvalidTypeError(
-        f"`{name}` is {describe(image)}; pass a path, a PIL image, a numpy array (H, W, 3) or a tensor (3, H, W)."
-    )
+    raise InvalidTypeError(f"`{name}` is {describe(image)}; pass a path, PIL image, array (H, W, 3), tensor (3, H, W).")
 
 
 def _decoded(name: str, image: Any) -> np.ndarray:

@@ -271,16 +271,10 @@ class UniTouchModel(PreTrainedModel):
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
-        cls,
-        pretrained_model_name_or_path: str | os.PathLike,
-        *,
-        modalities: Iterable[str] = (),
-        dtype: torch.dtype | None = None,
-        subfolder: str = "",
-        variant: str | None = None,
-        config: UniTouchConfig | None = None,
-        **kwargs: Any,
-    ) -> Self:
+        cls, pretrained_model_name_or_path: str | os.PathLike, *, modalities: Iterable[str] = (),
+        dtype: torch.dtype | None = None, subfolder: str = "", variant: str | None = None,
+        config: UniTouchConfig | None = None, **kwargs: Any,
+    ) -> Self:  # fmt: skip
         """Reads a model from a folder of safetensors, or from a repository id.
 
         Args:

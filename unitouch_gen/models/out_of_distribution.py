@@ -81,7 +81,7 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
     return torch.cat([patches.float().mean(dim=(-2, -1)), of_pixels.to(patches.device)], dim=1)
 
 
-def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int = 4) -> None:
+def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int) -> None:
     """One warning on the touches that a model abstains from; by the stack level it names the user's line."""
     rows = [row for row, reason in enumerate(reasons) if reason]
     named = "; ".join(f"`touch{f'[{row}]' * (len(reasons) > 1)}`: {reasons[row]}" for row in rows[:3])

@@ -177,9 +177,7 @@ def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) 
                     continue
                 yield from (shown(frame, container.streams.video[0]) for frame in decoded)
     except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # the last of a file without a video
-        raise InvalidInputError(
-            f"`{name}` is {str(place)!r}, which cannot be read as a video ({first_line(error)})."
-        ) from error
+        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no video ({first_line(error)}).") from error
 
 
 def shown(frame: Any, stream: Any) -> np.ndarray:

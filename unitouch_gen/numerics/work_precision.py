@@ -68,15 +68,9 @@ def problem_target(problem: Problem, seeds: int = 8) -> Target:
 
 @torch.no_grad()
 def pipeline_target(
-    pipe: Any,
-    inputs: Mapping[str, Tensor],
-    *,
-    name: str = "",
-    seeds: int = 2,
-    guidance_scale: float | None = None,
-    rtol: float = 1e-4,
-    **options: Any,
-) -> Target:
+    pipe: Any, inputs: Mapping[str, Tensor], *, name: str = "", seeds: int = 2, guidance_scale: float | None = None,
+    rtol: float = 1e-4, **options: Any,
+) -> Target:  # fmt: skip
     """The network of a pipeline under conditions, from some noises each.
 
     Args:

@@ -7,9 +7,8 @@ from torch import Tensor
 from unitouch_gen.world.attributes import ATTRIBUTES
 from unitouch_gen.world.captions import HARDNESS_WORDS, ROUGHNESS_WORDS, described, direction_word, word_below
 from unitouch_gen.world.draws import Draws
-from unitouch_gen.world.grasps import grasp_margin
 from unitouch_gen.world.materials import MATERIALS, Material
-from unitouch_gen.world.scene import YIELD
+from unitouch_gen.world.scene import YIELD, grasp_margin
 
 QUESTIONS: dict[str, tuple[str, ...]] = {
     "caption": ("Describe it.", "What is seen and felt?", "What can you say of this touch?"),

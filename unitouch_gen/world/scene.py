@@ -23,7 +23,6 @@ from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
-from unitouch_gen.world.grasps import grasp_margin
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.sensors import SENSORS, Sensor
@@ -76,14 +75,10 @@ class World:
 
     @torch.no_grad()
     def render(
-        self,
-        material: Sequence[int] | Tensor,
-        object: Sequence[int] | Tensor,
-        contact: Sequence[int] | Tensor,
-        *,
+        self, material: Sequence[int] | Tensor, object: Sequence[int] | Tensor, contact: Sequence[int] | Tensor, *,
         modalities: Sequence[str] = ("image", "touch", "audio", "text"),
         sensors: Sequence[str | Sensor] = ("gelsight",),
-    ) -> Scene:
+    ) -> Scene:  # fmt: skip
         """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
 
         Args:
@@ -128,9 +123,8 @@ class World:
             if "depth" in asked:
                 scene.depth[sensor.name] = in_view(displacement, size)
             if "attributes" in asked:
-                scene.attributes[sensor.name] = contact_attributes(
-                    in_view(indentation, size), sensor.field_of_view, draws.compliance
-                )
+                pressed, view = in_view(indentation, size), sensor.field_of_view
+                scene.attributes[sensor.name] = contact_attributes(pressed, view, draws.compliance)
 
         # 4. Grasps, sounds and captions.
         if "grasp" in asked:
@@ -156,6 +150,15 @@ class World:
         return images.clamp_(0.0, 1.0)
 
 
+def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, share: Tensor) -> Tensor:
+    """Force that two fingers carry over the object's weight (N,), at a depth in mm and a share of the gel in contact.
+
+    Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth and share. Above 1 they lift, as
+    about two of three do at 3 N for each mm.
+    """
+    return 2.0 * friction * (3.0 * indentation_depth * share) / weight
+
+
 def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
     """Sensors by name, or as they are; each once."""
     found: dict[str, Sensor] = {}
@@ -173,9 +176,7 @@ def _numbers(label: str, values: object, count: int | None = None, most: float =
     try:
         numbers = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidTypeError(
-            f"`{label}` cannot be read as integers ({first_line(error)}); pass one for each contact."
-        ) from error
+        raise InvalidTypeError(f"`{label}` cannot be read as integers ({first_line(error)}); pass one each.") from error
     if numbers.is_sparse or numbers.dtype == torch.bool or not torch.can_cast(numbers.dtype, torch.int64):
         raise InvalidTypeError(f"`{label}` is {describe(values)}; it has to hold integers.")
     if numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
