@@ -76,7 +76,7 @@ def test_closed_gates_and_detaching_leave_every_bit_and_open_gates_do_not(parts,
     bridge.gates.zero_()
     attached = bridge.attach(model, EMBEDS)
     assert torch.equal(generate(model, **MODES[mode]), before) and torch.equal(model(IDS).logits, logits)
-    attached.close()
+    attached.detach()
     assert torch.equal(model(IDS).logits, logits) and not torch.equal(open_, before)
     assert not any(module._forward_pre_hooks for module in model.modules())
 

@@ -34,6 +34,12 @@ class SwiGLU(nn.Module):
         return x + self.w2(F.silu(self.w1(normed)) * self.w3(normed))
 
 
+class Attachment(ExitStack):
+    """The hooks of a bridge in a language model; `detach()`, or the end of a `with` block, removes them."""
+
+    detach = ExitStack.close
+
+
 class LanguageBridge(ModelMixin, ConfigMixin):
     """Projection, residual blocks, a query of each layer, and a zero-initialised gate of each head.
 
@@ -99,8 +105,8 @@ class LanguageBridge(ModelMixin, ConfigMixin):
                 )
         return attentions
 
-    def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> ExitStack:
-        """Lets a language model answer about embeddings (B, D), one for each of its inputs, until the stack is closed.
+    def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> Attachment:
+        """Lets a language model answer about embeddings (B, D), one for each of its inputs, until it is detached.
 
         `generate` may repeat each input, as it does for beams and several answers. While gradients are on, they reach
         the bridge. Not for several threads at once: each would see what all have attached.
@@ -110,7 +116,7 @@ class LanguageBridge(ModelMixin, ConfigMixin):
             NonFiniteError: If an adapter token is not finite.
         """
         attentions = self.check_fits(language_model)
-        adapters, attached = self(embeds), ExitStack()
+        adapters, attached = self(embeds), Attachment()
         if not bool(adapters.isfinite().all()):
             raise NonFiniteError("The adapter of an embedding is not finite; run the bridge in float32 or bfloat16.")
         for layer, attention in enumerate(attentions):
