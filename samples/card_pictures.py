@@ -14,8 +14,8 @@ from PIL import Image
 
 import unitouch_gen
 from drawing import draw_grid, save
+from unitouch_gen.cli.loading import DRAWING
 from unitouch_gen.examples import example, examples
-from unitouch_gen.pipelines.tiny import PIPELINES
 
 LABELS = {"image": "photo", "touch": "touch"}
 
@@ -23,7 +23,7 @@ LABELS = {"image": "photo", "touch": "touch"}
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/card.jpg"))
-    parser.add_argument("--pipeline", choices=PIPELINES, default="touch-to-image")
+    parser.add_argument("--pipeline", choices=DRAWING, default="touch-to-image")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 

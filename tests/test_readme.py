@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.processes import Child, finished, script
+from unitouch_gen.solvers import SOLVERS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 README, CONTRIBUTING = CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md"
@@ -35,6 +36,12 @@ def test_modules_in_commands_exist():
     assert modules
     for module in modules:
         assert find_spec(module), module
+
+
+def test_each_solver_has_a_row_and_is_in_the_reference():
+    table, reference = ((CHECKOUT / "docs" / name).read_text() for name in ("error_and_time.md", "reference.md"))
+    for name, solver in SOLVERS.items():
+        assert f"\n| `{name}` | {solver.order} |" in table and solver.sample.__name__ in reference, name
 
 
 def test_each_layout_of_data_sets_has_a_row():

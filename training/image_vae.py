@@ -18,7 +18,14 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
+from unitouch_gen.models.autoencoders import (
+    Autoencoder,
+    autoencoder_class,
+    encode,
+    encode_raw,
+    read_autoencoder,
+    scale_factor,
+)
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
 from unitouch_gen.training.recipe import Arguments, Settings, build

@@ -25,7 +25,7 @@ from unitouch_gen.training.data import DrawnContacts, Rendered, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.world import World
-from unitouch_gen.world.questions import QUESTIONS, answered
+from unitouch_gen.world.questions import TOPICS, answered
 
 PROMPT = "{question}\n"  # before an answer
 VARIANTS = 3  # of the wording of each topic
@@ -84,7 +84,7 @@ def pairs_of(sources: Sequence[Source], splits: Sequence[Rendered]) -> list[Pair
             asked = [answered(draws, measured, variant) for variant in range(VARIANTS)]
             pairs += [[pair for one in told for pair in one.values()] for told in zip(*asked, strict=True)]
         else:
-            questions = QUESTIONS["caption"] * len(QUESTIONS)
+            questions = TOPICS["caption"].questions * len(TOPICS)
             pairs += [[(question, caption) for question in questions] for caption in split.text]
     return pairs
 

@@ -10,6 +10,7 @@ from typing import Any
 from tests.benchmarks.measuring import Figures
 from unitouch_gen.files import write_file
 from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.world.questions import TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,7 +30,7 @@ def percent(share: float) -> str:
 
 # Quality --------------------------------------------------------------------------------------------------------------
 
-ANSWERS = ("contact place", "grain", "hard or soft", "grasp", "caption's attributes")
+ANSWERS = (*(topic.figure for topic in TOPICS.values() if topic.figure), "caption's attributes")
 SHARES = ("material", "of the touch", "of the photo", "within 20", *ANSWERS)
 """Ends of the names of figures that are shares; others are correlations and distances."""
 

@@ -21,7 +21,8 @@ def contacts() -> Contacts:
     """Of every material, whose touches, embeddings and attributes are their numbers."""
     material, number = torch.cartesian_prod(torch.arange(len(MATERIAL_NAMES)), torch.arange(OBJECTS)).T
     attributes = torch.zeros(len(material), len(ATTRIBUTES))
-    attributes[:, ATTRIBUTES.index("cover")] = torch.rand(len(material), generator=torch.Generator().manual_seed(0))
+    lying = [ATTRIBUTES.index(name) for name in ("cover", "place x", "place y")]
+    attributes[:, lying] = torch.rand(len(material), 3, generator=torch.Generator().manual_seed(0))
     draws = World(0).draw(material, number, torch.zeros_like(number))
     made = Contacts(
         np.zeros((len(material), 3, 8, 8), np.uint8), [None] * len(material), number, {"material": material},

@@ -4,7 +4,7 @@ import torch
 
 from unitouch_gen.training import language_model
 from unitouch_gen.world import ATTRIBUTES, MATERIALS, World
-from unitouch_gen.world.questions import QUESTIONS, answered
+from unitouch_gen.world.questions import TOPICS, answered
 
 
 def test_labels_are_the_answers_and_their_end(processor) -> None:
@@ -24,7 +24,7 @@ def test_answers_are_true_of_the_world() -> None:
     for variant in range(2):
         for row, told in enumerate(answered(draws, attributes, variant)):
             spec, measured = MATERIALS[int(names[0][row])], dict(zip(ATTRIBUTES, attributes[row].tolist(), strict=True))
-            assert all(question in QUESTIONS[topic] for topic, (question, _) in told.items())
+            assert all(question in TOPICS[topic].questions for topic, (question, _) in told.items())
             known = told["material"][1] == f"it is {spec.name}."
             assert known != (measured["cover"] < 0.12) and told["feel"][1].count(spec.feel[0]) == 1
             holds = told["grasp"][1] in ("yes, it would hold.", "no, it would hold.")

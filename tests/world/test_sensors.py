@@ -93,11 +93,12 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor: Sensor
 
 
 def test_every_value_of_a_calibrated_sensor_has_one_provenance_and_every_source_a_licence() -> None:
-    for entry in json.loads(NUMBERS.read_text()).values():
+    for name, entry in json.loads(NUMBERS.read_text()).items():
         parts = [part for part in entry.values() if isinstance(part, dict)]
         assert entry.keys() <= {"source", "licence", "published", "measured", "fitted", "guessed", "settings"}
         assert sum(map(len, parts)) == len(set().union(*parts))
         assert len(entry["source"]) == len(entry["licence"]) > 0
+        assert len(SENSORS[name].azimuths) == len(SENSORS[name].elevation) == len(SENSORS[name].colours)
 
 
 def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:

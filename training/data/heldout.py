@@ -18,7 +18,7 @@ from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE, World
-from unitouch_gen.world.questions import QUESTIONS, asked_of
+from unitouch_gen.world.questions import TOPICS, asked_of
 
 FIRST_SEED = 1000
 """Of the worlds that models are held against: beyond those that recipes train on."""
@@ -62,7 +62,7 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     if "material" in labels and bool((labels["material"] >= 0).all()):
         known["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
     asked = [
-        {topic: (QUESTIONS[topic][0], [answers[row]]) for topic, answers in known.items()}
+        {topic: (TOPICS[topic].questions[0], [answers[row]]) for topic, answers in known.items()}
         for row in range(len(data) if known else 0)
     ]
     return Contacts(

@@ -12,7 +12,7 @@ import torch
 from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
-from unitouch_gen.world.questions import QUESTIONS
+from unitouch_gen.world.questions import TOPICS
 
 Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
@@ -67,8 +67,8 @@ def asking_tab(pipe: Any) -> None:
     with gradio.Row():
         with gradio.Column():
             touch = upload("touch", "Touch")
-            asked = [wordings[0] for topic, wordings in QUESTIONS.items() if topic != "caption"]
-            question = gradio.Dropdown(asked, value=asked[1], label="Question", allow_custom_value=True)
+            asked = [topic.questions[0] for topic in TOPICS.values()]
+            question = gradio.Dropdown(asked, value="How does it feel?", label="Question", allow_custom_value=True)
             button = gradio.Button("Ask", variant="primary")
         with gradio.Column():
             results = [gradio.Textbox(label="Answer"), gradio.Textbox(label="Run report", lines=2)]

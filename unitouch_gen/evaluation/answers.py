@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,10 @@ from unitouch_gen.evaluation.metrics import cosines
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 from unitouch_gen.world import MATERIALS
 from unitouch_gen.world.captions import DIRECTION_WORDS, HARDNESS_WORDS, ROUGHNESS_WORDS, SHAPE_WORDS
+from unitouch_gen.world.questions import TOPICS
 
 Asked = Mapping[str, tuple[str, Sequence[str]]]
 """By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
-
-ANSWER_CLASSES: dict[str, dict[str, str]] = {
-    "place": {word: word for word in ("all over", "centre", "left", "right", "above", "below")},
-    "grain": {word: word for word in DIRECTION_WORDS},
-    "feel": {word: "hard" if word in ("hard", "firm") else "soft" for word in HARDNESS_WORDS},
-    "grasp": {"hold": "hold", "slip": "slip"},
-}
-"""By topic: the class of answer that each word stands for."""
-
-COLUMNS = {"material": "material", "place": "contact place", "grain": "grain", "feel": "hard or soft", "grasp": "grasp"}
 
 FELT = (
     *ROUGHNESS_WORDS, *HARDNESS_WORDS, *DIRECTION_WORDS, "regular", "irregular", "fine", "coarse",
@@ -38,9 +30,6 @@ FELT = (
     *(word for material in MATERIALS for word in (material.name, *material.feel)),
 )  # fmt: skip
 """What captions say that can be felt: all but colours."""
-
-RATING = Path(__file__).with_name("rating.txt")
-"""Asks for a number from 1 to 5 for {answer}, where {truth} is true."""
 
 
 def caption_table(
@@ -93,16 +82,15 @@ def measured(
 ) -> Figures:
     """Figures of answers by topic, each to one of the questions that were asked."""
     figures = Figures()
-    for topic, words in {"material": {name: name for name in materials}, **ANSWER_CLASSES}.items():
-        if topic not in answers:
+    for name, topic in TOPICS.items():
+        if name not in answers or not topic.figure:
             continue
-        truths = [class_of(one[topic][1][0], words) for one in asked]
-        pairs = list(zip(truths, [class_of(text, words) for text in answers[topic]], strict=True))
+        words = topic.words or {material: material for material in materials}
+        truths = [class_of(one[name][1][0], words) for one in asked]
+        pairs = list(zip(truths, [class_of(text, words) for text in answers[name]], strict=True))
         right = {true: [true == said for other, said in pairs if other == true] for true, _ in pairs if true}
-        shares = [sum(found) / len(found) for found in right.values()]
-        balanced = topic in ("feel", "grasp")
-        count = sum(map(len, right.values()))
-        figures[COLUMNS[topic]] = sum(shares) / len(shares) if balanced else sum(map(sum, right.values())) / count
+        groups = list(right.values()) if topic.balanced else [[*chain(*right.values())]]
+        figures[topic.figure] = sum(sum(found) / len(found) for found in groups) / len(groups)
     if "caption" in answers:
         true = [list(one["caption"][1]) for one in asked]
         shares = []
@@ -134,7 +122,8 @@ def rated(judge: Path, truths: Sequence[str], answers: Sequence[str]) -> list[fl
     """Ratings from 1, wrong, to 5 by a causal language model of a folder: the mean over its next token's digits."""
     tokenizer = AutoTokenizer.from_pretrained(judge)
     model = AutoModelForCausalLM.from_pretrained(judge, use_safetensors=True).eval()
-    digits, template, found = tokenizer.convert_tokens_to_ids(list("12345")), RATING.read_text(), list[float]()
+    template = Path(__file__).with_name("rating.txt").read_text()  # asks for a number for {answer}, if {truth} is true
+    digits, found = tokenizer.convert_tokens_to_ids(list("12345")), list[float]()
     for truth, answer in zip(truths, answers, strict=True):
         ids = tokenizer(template.format(truth=truth, answer=answer), return_tensors="pt")["input_ids"]
         shares = model(ids).logits[0, -1, digits].float().softmax(dim=0)

@@ -1,27 +1,50 @@
 """Questions about contacts, with answers that are true of the draws and of what is measured of them."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from unitouch_gen.world.attributes import ATTRIBUTES
-from unitouch_gen.world.captions import HARDNESS_WORDS, ROUGHNESS_WORDS, described, direction_word, word_below
+from unitouch_gen.world.captions import (
+    DIRECTION_WORDS,
+    HARDNESS_WORDS,
+    ROUGHNESS_WORDS,
+    described,
+    direction_word,
+    word_below,
+)
 from unitouch_gen.world.draws import Draws
-from unitouch_gen.world.materials import MATERIALS, Material
+from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.scene import YIELD, grasp_margin
 
-QUESTIONS: dict[str, tuple[str, ...]] = {
-    "caption": ("Describe it.", "What is seen and felt?", "What can you say of this touch?"),
-    "material": ("What is it?", "What is it made of?", "Which material is this?"),
-    "feel": ("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
-    "place": ("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
-    "grain": ("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
-    "grasp": ("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
-}
-"""Topics, and how each may be asked about."""
+
+@dataclass(frozen=True)
+class Topic:
+    """What can be asked about contacts, and what tells answers apart in figures."""
+
+    questions: tuple[str, ...]  # how it may be asked about
+    figure: str = ""  # name of the share of answers that are right; none for free text
+    words: Mapping[str, str] = field(default_factory=dict)  # in answers, with what each stands for; else materials
+    balanced: bool = False  # whether the share is the mean over what is true, however rare
+
+
+TOPICS: dict[str, Topic] = {
+    "caption": Topic(("Describe it.", "What is seen and felt?", "What can you say of this touch?")),
+    "material": Topic(("What is it?", "What is it made of?", "Which material is this?"), "material"),
+    "feel": Topic(("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
+                  "hard or soft", {word: ("soft", "hard")[word in ("hard", "firm")] for word in HARDNESS_WORDS}, True),
+    "place": Topic(("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
+                   "contact place", {word: word for word in ("all over", "centre", "left", "right", "above", "below")}),
+    "grain": Topic(("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
+                   "grain", {word: word for word in DIRECTION_WORDS}),
+    "grasp": Topic(("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
+                   "grasp", {"hold": "hold", "slip": "slip"}, True),
+}  # fmt: skip
+"""By name; `answered` says what is true of each."""
 
 UNTOLD = 0.12  # share of the view in contact below which the material cannot be told
-PLACE = ("cover", "place x", "place y")
 ALL_OVER, CENTRED = 0.9, 0.12  # share above which contact is all over; distance, half views, of a contact in the centre
 
 
@@ -39,26 +62,22 @@ def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[st
     holds = (grasp_margin(draws.of_material("friction"), draws.weight, depth, cover) > 1.0).tolist()
     captions, found = described(draws, variant), []
     for row in range(len(draws)):
-        spec, place = MATERIALS[int(draws.material[row])], (measured[name][row] for name in PLACE)
-        asked = {topic: wordings[(row + variant) % len(wordings)] for topic, wordings in QUESTIONS.items()}
+        spec = MATERIALS[int(draws.material[row])]
+        asked = {name: topic.questions[(row + variant) % len(topic.questions)] for name, topic in TOPICS.items()}
+        roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
+        hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
+        bumps = "regular" if spec.regular else "irregular"
         agreed = holds[row] != ("slip" in asked["grasp"])
         answers = {
             "caption": f"{captions[row]}.",
             "material": f"it is {spec.name}." if measured["cover"][row] >= UNTOLD else "that cannot be told.",
-            "feel": feel_answer(spec, float(draws.amplitude[row]), float(draws.compliance[row])),
-            "place": place_answer(*place),
+            "feel": f"it feels {roughness}, {hardness} and {spec.feel[0]}, with {bumps} bumps.",
+            "place": place_answer(*(measured[name][row] for name in ("cover", "place x", "place y"))),
             "grain": f"it is {direction_word(float(draws.angle[row]))}." if spec.grained else "it has no grain.",
             "grasp": f"{'yes' if agreed else 'no'}, it would {'hold' if holds[row] else 'slip'}.",
         }
-        found.append({topic: (asked[topic], answer) for topic, answer in answers.items()})
+        found.append({topic: (question, answers[topic]) for topic, question in asked.items()})
     return found
-
-
-def feel_answer(spec: Material, amplitude: float, compliance: float) -> str:
-    """Roughness, hardness, a word for the texture, and how its bumps are."""
-    roughness = word_below(ROUGHNESS_WORDS, spec.roughness * amplitude)
-    bumps = "regular" if spec.regular else "irregular"
-    return f"it feels {roughness}, {word_below(HARDNESS_WORDS, compliance)} and {spec.feel[0]}, with {bumps} bumps."
 
 
 def place_answer(cover: float, x: float, y: float) -> str:
