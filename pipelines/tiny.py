@@ -114,18 +114,24 @@ SHOWN = {  # caption of a model card's picture; what its figures measure
 }
 
 
+CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
+"""What stands beside a figure."""
+
+
 def _card(family: Path, name: str) -> Card:
     """The model card of a family's pipeline: measured figures and, if built in, its training data."""
     caption, made = SHOWN[name]
     file = family / weights.FIGURES.name
     held = read_settings("family", file) if file.is_file() else {}
     rows = held.get("figures", {}).get("quality", {}).get("rows", {})
-    figures = {
-        key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
-        f"{row['ceiling']:.1%})"
-        for key, row in rows.items()
-        if re.fullmatch(rf"\w+ to {made}: (material|contact within material|grain within 20)", key)
-    }
+    told = (
+        rf"(\w+ to )?{made}: (material|contact within material|grain|grain within 20|hard or soft|contact place|grasp)"
+    )
+    figures = {}
+    for key, row in rows.items():
+        if re.fullmatch(told, key):
+            beside = [f"{words} {row[name]:.1%}" for name, words in CONTROLS.items() if row[name] is not None]
+            figures[key] = f"{row['value']:.1%} ({', '.join(beside)})"
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
     return Card(

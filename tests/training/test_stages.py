@@ -100,7 +100,7 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
-@pytest.mark.parametrize("name", ["touch", "unclip"])
+@pytest.mark.parametrize("name", ["touch", "unclip", "language_model", "touch_llm"])
 def test_a_stage_that_was_stopped_goes_on_to_the_same_bits(name: str, runs: Path) -> None:
     shutil.copytree(runs / name, runs / f"{name}-again")
     (checkpoints_in(runs / f"{name}-again")[-1] / "progress.json").unlink()
