@@ -107,4 +107,5 @@ def odd_array(draw: random.Random) -> Any:
     values.flat[: draw.choice([0, 8])] = 0.25
     with np.errstate(all="ignore"):
         array = values.astype(draw.choice(["u1", "i1", "u2", "i8", "f2", "f4", ">f4", "f8", "c8", "?", "O", "U8"]))
-    return torch.from_numpy(array) if draw.random() < 0.5 and array.dtype.char in "BbHlefd?" else array
+    plain = array.dtype.isnative and array.dtype.char in "BbHlefd?"
+    return torch.from_numpy(array) if draw.random() < 0.5 and plain else array

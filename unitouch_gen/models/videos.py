@@ -164,6 +164,7 @@ def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) 
     Those that cannot be decoded are left out. Raises `InvalidInputError` if it cannot be read, or PyAV is missing.
     """
     av: Any = needed("av")
+    undecodable = av.FFmpegError  # which the module has no more when Python ends amid frames
     if form is None:
         check_file(name, place, "a video")
     options = {"protocol_whitelist": "file"} if form is None else {}  # a list of other places is no video
@@ -173,10 +174,10 @@ def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) 
             for packet in container.demux(video=0):
                 try:
                     decoded = packet.decode()
-                except av.FFmpegError:
+                except undecodable:
                     continue
                 yield from (shown(frame, container.streams.video[0]) for frame in decoded)
-    except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # the last of a file without a video
+    except (undecodable, OSError, ValueError, IndexError) as error:  # the last of a file without a video
         raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no video ({first_line(error)}).") from error
 
 
