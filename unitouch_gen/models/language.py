@@ -43,7 +43,7 @@ class Attachment(ExitStack):
 class LanguageBridge(ModelMixin, ConfigMixin):
     """Projection, residual blocks, a query of each layer, and a zero-initialised gate of each head.
 
-    F' = blocks(W e / |e| + b); a_l = F' + q_l; before `o_proj` of layer l, head h of every token gets
+    F' = blocks(W e + b), with e at unit length; a_l = F' + q_l; before `o_proj` of layer l, head h of every token gets
     tanh(g_lh) (W_v a_l)_h, with W_v the layer's own values. At gates of zero nothing is changed.
 
     Args:
