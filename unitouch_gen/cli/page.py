@@ -24,7 +24,7 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
     fields = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields}
     # Uploads and pictures stay on the disk for an hour.
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
-        gradio.Markdown("# unitouch_gen\nPictures of touches, touches of pictures, words and sounds, and answers about touches.")
+        gradio.Markdown("# unitouch_gen\nPictures of touches, touches of anything, and answers about touches.")
         with gradio.Tabs():
             for kind in [kind for kind in titles if kind in pipes]:
                 with gradio.Tab(titles[kind]):
