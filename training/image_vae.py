@@ -109,9 +109,8 @@ def make_autoencoder(model: Arguments) -> Autoencoder:
 
 def main(stage: Stage, modality: str = "image") -> None:
     recipe: AutoencoderRecipe = stage.recipe
-    vae, crop = make_autoencoder(recipe.model), recipe.augment.crop
-    if "init" in stage.folders:
-        vae = read_autoencoder(stage.folders["init"]).requires_grad_(True)
+    init, crop = stage.folders.get("init"), recipe.augment.crop
+    vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
     splits = stage.splits(modality)

@@ -1,5 +1,6 @@
 """Figures of answers about touches, on answers that are right or wrong by construction."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +27,7 @@ def contacts() -> Contacts:
     draws = World(0).draw(material, number, torch.zeros_like(number))
     made = Contacts(
         np.zeros((len(material), 3, 8, 8), np.uint8), [None] * len(material), number, {"material": material},
-        {"material": MATERIAL_NAMES}, asked=asked_of(draws, attributes),
+        {"material": MATERIAL_NAMES}, asked=partial(list, asked_of(draws, attributes)),
     )  # fmt: skip
     made.features = {"touch": torch.eye(len(material)), "image": torch.eye(len(material))}
     return made
@@ -36,7 +37,8 @@ class Knowing:
     """Answers what is true of the contact that a one-hot embedding names, or what is true of the first."""
 
     def __init__(self, contacts: Contacts):
-        self.asked, self.read = contacts.asked, iter(torch.eye(len(contacts.asked)))
+        self.asked = contacts.asked()
+        self.read = iter(torch.eye(len(self.asked)))
 
     def encode_touch(self, pixels, sensors):
         return torch.stack([next(self.read) for _ in range(len(pixels))])
@@ -50,7 +52,7 @@ class Knowing:
 
 
 def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
-    for one in contacts.asked:  # all are asked the same
+    for one in contacts.asked():  # all are asked the same
         for topic, (_, answers) in one.items():
             one[topic] = (topic, answers)
     rows = caption_table(Knowing(contacts), {"train": contacts, "test": contacts}, lambda texts: torch.eye(102)[::6], 6)

@@ -47,7 +47,8 @@ def world_contacts(
         image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds,
         relit=lambda: float_pixels(relit(cache, source, split, seen)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
-        attributes=attributes, asked=asked_of(World(source.seed).draw(*source.contacts(split)), attributes[:, 0]),
+        attributes=attributes,
+        asked=lambda: asked_of(World(source.seed).draw(*source.contacts(split)), attributes[:, 0]),
     )  # fmt: skip
 
 
@@ -69,7 +70,7 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
         seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
         image=seen.image, audio=seen.audio, text=seen.text if "text" in modalities else (), gel=seen.background,
         sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None,
-        asked=asked,
+        asked=lambda: asked,
     )  # fmt: skip
 
 

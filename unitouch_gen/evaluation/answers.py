@@ -48,8 +48,9 @@ def caption_table(
     """
     test, names = splits["test"], splits["test"].classes["material"]
     rows = some(test, each)
-    asked = [test.asked[row] for row in rows.tolist()]
-    usual = {topic: Counter(one[topic][1][0] for one in splits["train"].asked) for topic in asked[0]}
+    truths, before = test.asked(), splits["train"].asked()
+    asked = [truths[row] for row in rows.tolist()]
+    usual = {topic: Counter(one[topic][1][0] for one in before) for topic in asked[0]}
     pixels, known = float_pixels(test.touch[rows.numpy()]), [test.sensors[row] for row in rows.tolist()]
     touch = in_batches(len(rows), lambda part: pipe.encode_touch(pixels[part], known[part]))
     embeds = {"touch": touch, "shuffled touches": touch[others(len(touch))]}

@@ -33,7 +33,7 @@ class Contacts:
         attributes: `unitouch_gen.world.ATTRIBUTES` by either sensor, float32 (N, 2, K).
         sounds: Gives the sounds, as pipelines take them.
         relit: Gives the pictures under another lamp, float32 in [0, 1].
-        asked: By topic, a question about each contact, and answers that are true.
+        asked: Gives, by topic, a question about each contact, and answers that are true.
         features: (N, D) by name; see `embed`.
     """
 
@@ -50,7 +50,7 @@ class Contacts:
     attributes: Tensor | None = None
     sounds: Callable[[], Any] | None = None
     relit: Callable[[], Tensor] | None = None
-    asked: Sequence[Mapping[str, tuple[str, Sequence[str]]]] = ()
+    asked: Callable[[], Sequence[Mapping[str, tuple[str, Sequence[str]]]]] = tuple
     features: dict[str, Tensor] = field(default_factory=dict)
 
     @property
