@@ -1,5 +1,6 @@
 """Figures of answers about touches, on answers that are right or wrong by construction."""
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -61,6 +62,13 @@ def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
     assert usual["grasp"] == usual["hard or soft"] == 0.5 and usual["material"] < 0.1
     assert shuffled["material"] < 0.2 and shuffled["contact place"] < 0.9 and shuffled["ROUGE-L"] < 1.0
     assert rows["zero-shot classifier"] == {"material": pytest.approx(22 / 102)}  # a tie is the first one
+
+
+def test_a_data_set_may_have_captions_alone(contacts):
+    told = [{"caption": ("caption", one["caption"][1])} for one in contacts.asked()]
+    bare = replace(contacts, labels={}, classes={}, asked=lambda: told)
+    rows = caption_table(Knowing(bare), {"train": bare, "test": bare}, pytest.fail, 102)
+    assert rows["touch"] == pytest.approx({"caption's attributes": 1.0, "ROUGE-L": 1.0})
 
 
 def test_a_class_that_is_rare_counts_as_much_as_others():
