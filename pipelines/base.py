@@ -470,14 +470,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         with nullcontext() if isinstance(place, dict) else reading(name, place):
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
 
-    def load_sensor(self, file: str | os.PathLike) -> str:
-        """Adds a sensor of one's own to the joint space; see `UniTouchModel.load_sensor`."""
-        return self._joint("load_sensor").load_sensor(file)
-
-    def unload_sensor(self, name: str) -> None:
-        """Removes a sensor that `load_sensor` added."""
-        self._joint("unload_sensor").unload_sensor(name)
-
 
 def without_lora(components: dict[str, Any]) -> dict[str, Any]:
     """Networks that have LoRA layers without these: copies that share all weights, fused ones too."""

@@ -6,8 +6,6 @@
         measures nothing, and writes what is stored to the pages
     python -m tests.benchmarks --only quality --recordings FOLDER --photos FOLDER
         what the family is worth on the world and on real touches
-    python -m tests.benchmarks --only adapt --recordings FOLDER
-        a sensor adapted to recordings of real ones, see `adaptation`
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -20,7 +18,6 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from tests.benchmarks.adaptation import adapt_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures, in_turns, machine, quiet, seconds_of
 from tests.benchmarks.quality import quality_figures
@@ -42,10 +39,9 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "world": lambda given: world_figures(),
     "speed": lambda given: speed_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
-    "adapt": lambda given: adapt_figures(given.recordings),
 }
 
-NEEDED = {"quality": ("recordings",), "adapt": ("recordings",)}
+NEEDED = {"quality": ("recordings",)}
 """Options of parts that need what no checkout holds."""
 
 
@@ -53,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks")
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
     parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
-    parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `adaptation`")
+    parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `quality`")
     parser.add_argument("--photos", type=Path, help="folder of whole photos, which are restyled")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()

@@ -5,7 +5,7 @@
     python -m tests.benchmarks.quality --family runs/family --touched-by gelsight --photos FOLDER
         and what its pipelines make of a GelSight's touches, judged by its classifiers; photos are restyled, too
     python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER
-        and real touches: `gelsight_objects.zip` of `adaptation`, and if it is there `objectfolder_dataPack.npz`, the
+        and real touches: the `gelsight_objects.zip` of `clips`, and if it is there `objectfolder_dataPack.npz`, the
         ball presses of ObjectFolder 2.0 (github.com/rhgao/ObjectFolder, calibs/)
 
 Every seed is a world of its own, with objects, sensors and noise of its own. Figures are means over seeds.
@@ -28,7 +28,7 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor
 
-from tests.benchmarks import adaptation
+from tests.benchmarks.clips import GELSIGHT, Clips, square_pixels
 from tests.benchmarks.joint_space import JointSpace, agreed, found_within, held_out, material_rows
 from tests.benchmarks.measuring import Figures, attribute_agreement, cross_predicted, over_seeds, quiet
 from unitouch_gen import weights
@@ -254,18 +254,18 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
                  for name, model in spaces.items()}  # fmt: skip
         return found | {"statistics of the relief": relief_statistics(float_pixels(pixels))}
 
-    clips = adaptation.Clips.read(recordings / adaptation.GELSIGHT)
-    peaks, gels = (adaptation.square_pixels(frames, size) for frames in (clips.peaks, clips.gels))
+    clips = Clips.read(recordings / GELSIGHT)
+    peaks, gels = (square_pixels(frames, size) for frames in (clips.peaks, clips.gels))
     features = embedded(peaks[clips.labelled])
     features["untouched gel"] = joint.features("touch", gels[clips.labelled]).double().numpy()
     count = {"touches": int(clips.labelled.sum()), "objects": len(np.unique(clips.objects[clips.labelled]))}
     figures["abstention"] = {"touches": abstained(joint, peaks), "untouched gels": abstained(joint, gels)}
-    figures["recordings"] = {"of": count, **of_untrained(clips.probed(features, clips.labelled), "mean")}
+    figures["recordings"] = {"of": count, **of_untrained(clips.probed(features), "mean")}
     if (presses := next(recordings.rglob(PRESSES), None)) is not None:
         with np.load(presses) as pack:
             frames = [frame.astype(np.float32) for frame in pack["imgs"]]
             rest, place = pack["f0"].astype(np.float32), torch.from_numpy(pack["touch_center"].astype(np.float64))
-        features = embedded(adaptation.square_pixels(frames, size))
+        features = embedded(square_pixels(frames, size))
         features["statistics"] = statistics([frame - rest for frame in frames])
         balls = {}
         for name, values in features.items():  # R^2 of both coordinates, each ball predicted from the others
@@ -348,7 +348,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--family", type=Path, help="folder with the layout of the built-in one: what it makes")
     parser.add_argument("--picture-classifier", type=Path, help="folder; the family's if left out")
     parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
-    parser.add_argument("--recordings", type=Path, help=f"folder with {adaptation.GELSIGHT}, and perhaps {PRESSES}")
+    parser.add_argument("--recordings", type=Path, help=f"folder with {GELSIGHT}, and perhaps {PRESSES}")
     parser.add_argument("--touched-by", choices=SENSORS, help="whose touches are read; drawn ones if left out")
     parser.add_argument("--split", default="test", choices=("val", "test", "beyond"))
     parser.add_argument("--seeds", type=int, default=3, help="worlds")

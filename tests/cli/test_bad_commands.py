@@ -50,7 +50,6 @@ BAD = {
         ("app --host no.such.host.invalid", "'no.such.host.invalid'"),
         ("classify in/dark.png --labels wood", "`labels`"),
         ("classify in/dark.png --template feels", "`template`"),
-        ("adapt in --sensor mine --steps 0", "--steps"),
         ("doctor --device meta", "`--device` is 'meta'"),
     ],
     "files": [
@@ -60,14 +59,12 @@ BAD = {
         ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
         ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cannot be read as an image"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
-        (f"{TO_IMAGE} --load-sensor in/dark.png", "`file` is", "cannot be read"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
         (f"{TO_TOUCH} --audio silence.wav", "`audio` is silent"),
         (f"{TO_TOUCH} --audio in/dark.png", "cannot be read as a sound"),
         ("batch gone -o out", "'gone', which does not exist"),
         ("convert unitouch --touch gone.ckpt -o out", "gone.ckpt"),
         ("convert unitouch --touch in/dark.png -o out", "cannot be read as a checkpoint"),
-        ("adapt nowhere --sensor mine", "nowhere"),
     ],
     "models": [
         ("touch-to-image in/dark.png -o out --model gone", "`--model` is 'gone', which is no folder"),
@@ -90,7 +87,6 @@ BAD = {
         ("touch-to-image in/dark.png -o words.png/below", "`--output`", "cannot be written to"),
         ("touch-to-image in/dark.png -o /proc/self/out", "`--output`", "cannot be written to"),
         ("batch in -o /proc/self/out", "`--output`", "cannot be written to"),
-        ("adapt in --sensor mine -o mine.png", "name a .safetensors file"),
     ],
 }  # fmt: skip
 

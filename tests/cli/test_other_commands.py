@@ -1,13 +1,11 @@
-"""`unitouch-gen ask`, `classify`, `convert`, `adapt` and `doctor`: what they write and print."""
+"""`unitouch-gen ask`, `classify`, `convert` and `doctor`: what they write and print."""
 
 import json
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from tests.helpers.components import make_components
 from tests.helpers.language import make_language_parts
@@ -46,20 +44,6 @@ def test_published_files_become_a_folder(command, tmp_path):
     assert (code, err) == (0, "") and "CC-BY-NC-4.0" in out
     model = UniTouchModel.from_pretrained(tmp_path / "model", dtype=torch.bfloat16)
     assert model.known_modalities == ("image", "text", "audio", "touch")
-
-
-@built_in
-def test_a_folder_of_touches_becomes_a_sensor(command, refused, tmp_path):
-    (tmp_path / "mine").mkdir()
-    for number in range(10):
-        pixels = np.random.default_rng(number).integers(0, 256, (70, 64, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(tmp_path / "mine" / f"{number}.png")
-    file = tmp_path / "out" / "mine.safetensors"
-    words = ("adapt", tmp_path / "mine", "--sensor", "mine", "--steps", 2, "-o", file)
-    code, out, _ = command(*words)
-    assert code == 0 and str(file) in out.replace("\n", "")
-    assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
-    refused(command(*words), "pass `--overwrite`")
 
 
 def test_doctor_says_what_a_picture_takes(command, models):

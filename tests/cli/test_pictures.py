@@ -14,8 +14,6 @@ from tests.helpers import recordings
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.pictures import save, unique
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.sensors import AddedSensor, fingerprint
 
 
 @pytest.fixture
@@ -99,15 +97,6 @@ def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
     weights = '--set weights={"text":1,"image":0}'
     run(f"x-to-touch --image in/dark.png --text brick -o weighed.png {weights}")
     assert same("weighed.png", "text.png", tolerance=0)
-
-
-@pytest.mark.parametrize("named", ["", "--sensor mine"])
-def test_a_sensor_of_ones_own_is_added_for_a_command(here, run, models, named):
-    encoder, bank = UniTouchModel.from_pretrained(f"{models['touch-to-image']}/unitouch").load("touch")
-    dark = torch.full((3, bank.prototype_size, bank.prototype_size), 50 / 255)
-    AddedSensor("mine", fingerprint(encoder), torch.zeros(bank.tokens.shape[1:]), dark).save(here / "mine.safetensors")
-    (row,) = run(f"touch-to-image in/dark.png -o out --load-sensor mine.safetensors {named}")["pictures"]
-    assert row["touch_sensor"] == "mine"
 
 
 # Inputs ---------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The sensor bank: retrieval by L1 distance against numpy, names, reaches, added sensors, and a bank of none."""
+"""The sensor bank: retrieval by L1 distance against numpy, names, reaches, and a bank of none."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ import torch
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import SensorBank, SensorMatch
-from unitouch_gen.models.sensors import AddedSensor, fingerprint
 
 NAMES = ("gelsight", "digit", "taxim")
 
@@ -87,20 +86,6 @@ def test_reaches_are_of_areas_and_the_sensor_whose_own_touches_lie_as_far_is_ret
     assert reaching(dark=0.05, bright=0.4).match(levels(0.41))[0].name == "bright"  # nearer to the dark one
     checks = 0.2 + 0.2 * (-1.0) ** (torch.arange(32)[:, None] + torch.arange(32)).expand(1, 3, 32, 32)
     assert reaching(dark=0.01, bright=0.01).match(checks)[0].name == "dark"
-
-
-def test_an_added_sensor_stands_behind_the_others_with_the_widest_reach_unless_it_brings_its_own() -> None:
-    bank, encoder = reaching(dark=0.05, bright=0.1), torch.nn.Linear(2, 2)
-    new = (fingerprint(encoder), torch.ones(5, 16), torch.full((3, 32, 32), 0.5))
-    sensors = [AddedSensor("new", *new), AddedSensor("other", *new, reach=0.02)]
-    added = bank.with_added(sensors[0], encoder).with_added(sensors[1], encoder)
-    assert added.names == ("dark", "bright", "new", "other") and bank.names == ("dark", "bright")
-    assert added.reaches == {"dark": 0.05, "bright": 0.1, "new": 0.1, "other": 0.02}
-    assert torch.equal(added.tokens[:2], bank.tokens) and torch.equal(added.tokens[2], new[1])
-    assert added.match(levels(0.5))[0].name in ("new", "other")
-    again = added.without("new").without("other").state_dict()
-    assert again.keys() == bank.state_dict().keys()
-    assert all(torch.equal(value, bank.state_dict()[key]) for key, value in again.items())
 
 
 def test_each_row_gets_the_tokens_of_its_sensor() -> None:

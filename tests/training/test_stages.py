@@ -139,7 +139,7 @@ def family(runs: Path) -> Path:
 def test_a_family_becomes_pictures_and_touches(family: Path) -> None:
     pipe = tiny("touch-to-image", family=family)
     pipe.set_progress_bar_config(disable=True)
-    assert pipe.unitouch.sensors == ("gelsight", "digit")
+    assert pipe.unitouch.config.sensors == ["gelsight", "digit"]
     touch = World(0, image_size=32).render([0], [0], [0], modalities=("touch",), sensors=("digit",)).touch["digit"]
     picture = pipe(touch, num_inference_steps=2, output_type="np").images
     assert picture.shape == (1, 32, 32, 3) and np.isfinite(picture).all()

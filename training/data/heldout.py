@@ -109,7 +109,7 @@ def of_world(
         source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects)
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
         embed_all(model, processor, splits)
-        yield sensor or "sensors drawn anew", sensor in model.sensors, source.seed, splits
+        yield sensor or "sensors drawn anew", sensor in model.config.sensors, source.seed, splits
 
 
 def of_datasets(cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
@@ -117,7 +117,7 @@ def of_datasets(cache: Path, model: UniTouchModel, processor: UniTouchProcessor,
     for data in sets:
         splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
         embed_all(model, processor, splits)
-        yield data.name, {record.sensor for record in data.records} <= {*model.sensors}, 0, splits
+        yield data.name, {record.sensor for record in data.records} <= {*model.config.sensors}, 0, splits
 
 
 def embed_all(model: UniTouchModel, processor: UniTouchProcessor, splits: Splits) -> None:

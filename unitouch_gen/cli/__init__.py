@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from unitouch_gen import __version__
-from unitouch_gen.cli.adapt import adapt
 from unitouch_gen.cli.app import app
 from unitouch_gen.cli.ask import ask
 from unitouch_gen.cli.batch import batch
@@ -42,7 +41,7 @@ def options(
 
 
 drawing = (touch_to_image, stylize, x_to_touch, batch, app)
-for function in (*drawing, ask, classify, adapt, evaluate, work_precision, stability, doctor):
+for function in (*drawing, ask, classify, evaluate, work_precision, stability, doctor):
     commands.command()(function)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")

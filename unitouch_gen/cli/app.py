@@ -16,7 +16,6 @@ def app(
     host: Annotated[str, typer.Option(help="To serve at; 0.0.0.0 lets in everyone who reaches it.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve at.")] = 7860,
     model: Annotated[list[str] | None, typer.Option(help=f"{options.A_FOLDER} a pipeline; repeatable.")] = None,
-    load_sensor: options.LoadSensor = None,
     dtype: options.Dtype = None,
     device: options.Device = "auto",
 ) -> None:
@@ -36,7 +35,7 @@ def app(
         needed("gradio", "app")
         from unitouch_gen.cli.page import launch
 
-        shared: Any = {"dtype": dtype, "device": device, "load_sensor": load_sensor}
+        shared: Any = {"dtype": dtype, "device": device}
         page = launch({kind: load_pipeline(kind, model=one, **shared) for kind, one in models.items()}, host, port)
         typer.echo(f"The page is at http://{host}:{port} (Ctrl-C ends it)")
         page.block_thread()

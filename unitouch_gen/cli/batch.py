@@ -32,7 +32,7 @@ def batch(
     pipeline: Annotated[str, Option(help=f"{', '.join(DRAWING)}.")] = "touch-to-image",
     sensor: options.Sensor = None, num_inference_steps: options.Steps = None, settings: options.Settings = None,
     seed: options.Seed = 0, batch_size: options.BatchSize = 8, model: options.Model = None,
-    load_sensor: options.LoadSensor = None, dtype: options.Dtype = None, device: options.Device = "auto",
+    dtype: options.Dtype = None, device: options.Device = "auto",
 ) -> None:  # fmt: skip
     """Makes the pictures of a table or a folder that are not there yet; exits with 1 if some fail.
 

@@ -84,7 +84,7 @@ def evaluate(
         if folders:
             sets = of_datasets(place, joint, processor, folders)
         else:
-            known = [name for name in NAMED if name in joint.sensors]
+            known = [name for name in NAMED if name in joint.config.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
         made = figures_of(names, sets, joint, processor, pipes, each, judge)
     facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
@@ -120,7 +120,7 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
     if "touch" not in joint.known_modalities or not usable:
         wanted = " or ".join(sorted(asked))
         raise InvalidInputError(f"`--model` has no encoders of touch and {wanted}, which {name!r} needs.")
-    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.sensors}):
+    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.config.sensors}):
         raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
     for data in folders:
         parts = parts_of(data)

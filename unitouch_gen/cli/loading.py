@@ -85,9 +85,8 @@ def files_in(folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> 
 
 
 def load_pipeline(
-    name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu",
-    load_sensor: Sequence[Path] | None = None, quiet: bool = True, **_others: Any,
-) -> Any:  # fmt: skip
+    name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu", quiet: bool = True, **_others: Any
+) -> Any:
     """A pipeline, one of `CLASSES`, by a command's options: of a folder or repository, or built in."""
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
@@ -112,8 +111,6 @@ def load_pipeline(
         folder = folder_of(model)
         with reading("--model", model):
             pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=weights_dtype)
-    for file in load_sensor or ():
-        pipe.load_sensor(file)
     pipe.set_progress_bar_config(disable=quiet)
     return pipe.to(place)
 

@@ -45,7 +45,6 @@ BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer t
 
 # Models
 Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline; built-in if left out.")]
-LoadSensor = Annotated[list[Path] | None, Option(**FILE, help="A sensor that `unitouch-gen adapt` wrote; repeatable.")]
 Dtype = Annotated[str | None, Option(help="float32, float16, bfloat16 or float64; float32 if left out.")]
 Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")]
 

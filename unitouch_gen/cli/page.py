@@ -85,7 +85,7 @@ def asking_tab(pipe: Any) -> None:
 
 
 def touch_fields(pipe: Any) -> Fields:
-    sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.sensors)]
+    sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.config.sensors)]
     return {
         "touch": upload("touch", "Touch"),
         "prompt": gradio.Textbox("", label="Prompt", info="What else the picture should be.", max_lines=3),

@@ -34,7 +34,7 @@ def touch_to_image(
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    model: options.Model = None, dtype: options.Dtype = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
 ) -> None:  # fmt: skip
     """Makes a picture of what each touch feels like.
@@ -58,7 +58,7 @@ def stylize(
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    model: options.Model = None, dtype: options.Dtype = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
 ) -> None:  # fmt: skip
     """Restyles a photo by each touch.
@@ -86,7 +86,7 @@ def x_to_touch(
     num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
     guidance_scale: options.Guidance = None, settings: options.Settings = None,
     num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    model: options.Model = None, dtype: options.Dtype = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
 ) -> None:  # fmt: skip
     """Makes touch images of what is seen, read, heard, or felt by another sensor.

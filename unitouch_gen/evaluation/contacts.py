@@ -109,7 +109,7 @@ def embed(
 @torch.no_grad()
 def image_embeddings(model: UniTouchModel, modality: str, images: Any, sensors: Sequence[str | None] = ()) -> Tensor:
     """Features (N, D) of pictures or touches (N, 3, S, S); a sensor that the model does not know is retrieved."""
-    known = [name if name in model.sensors else None for name in sensors or [None] * len(images)]
+    known = [name if name in model.config.sensors else None for name in sensors or [None] * len(images)]
 
     def encode(rows: slice) -> Tensor:
         pixels = normalise_pixels(float_pixels(images[rows])).to(model.device)

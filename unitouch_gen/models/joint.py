@@ -14,12 +14,12 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
-from unitouch_gen.files import as_path, check_file, local_folder, read_settings, reading, saved_whole
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
+from unitouch_gen.files import check_file, local_folder, read_settings, reading, saved_whole
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
-from unitouch_gen.models.sensors import AddedSensor, SensorBank, SensorMatch, Sensors
+from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
@@ -32,8 +32,8 @@ MODULES: dict[str, tuple[str, ...]] = {
 }
 """Sub-modules of each modality; also the key prefixes on disk."""
 
-_READING = threading.RLock()
-"""Held while an encoder is read or a sensor added: threads that share a model do it once."""
+_READING = threading.Lock()
+"""Held while an encoder is read: threads that share a model do it once."""
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
@@ -168,33 +168,6 @@ class UniTouchModel(PreTrainedModel):
         threshold = self.config.ood_thresholds["touch"]["foreign"]
         return [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the known sensors: those of training, then added ones."""
-        return self.sensor_bank.names if "touch" in self.loaded_modalities else tuple(self.config.sensors)
-
-    def load_sensor(self, file: str | os.PathLike) -> str:
-        """Adds a sensor that `unitouch-gen adapt` learned, and returns its name.
-
-        It replaces an added sensor of the same name. `save_pretrained` leaves added sensors out. Raises
-        `InvalidInputError` if the file holds no sensor for this touch encoder, or one that the model was trained with.
-        """
-        sensor = AddedSensor.read(as_path("file", file))
-        if sensor.name in self.config.sensors:
-            raise InvalidInputError(f"`file` brings {sensor.name!r}, which this model was trained with; rename it.")
-        with _READING, torch.inference_mode(False):
-            touch_model, bank = self.load("touch")
-            self._adopt({"sensor_bank": bank.with_added(sensor, touch_model)})
-        return sensor.name
-
-    def unload_sensor(self, name: str) -> None:
-        """Removes a sensor that `load_sensor` added. Not safe during a running call."""
-        added = self.sensors[len(self.config.sensors) :]
-        if name not in added:
-            raise InvalidInputError(f"`name` is {describe(name)}; added sensors are {[*added]}.")
-        with _READING:
-            self._adopt({"sensor_bank": self.sensor_bank.without(name)})
-
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
     @property
@@ -308,11 +281,7 @@ class UniTouchModel(PreTrainedModel):
         """Writes config and weights, all or none; encoders still on disk are read first and written, too."""
         for modality in self.known_modalities:
             self.load(modality)
-        state = self.state_dict()
-        for key in state:
-            if key.startswith("sensor_bank."):  # without added sensors
-                state[key] = state[key][: len(self.config.sensors)]
-        super().save_pretrained(save_directory, variant=variant, **{"state_dict": state, **kwargs})
+        super().save_pretrained(save_directory, variant=variant, **kwargs)
 
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:

@@ -1,18 +1,13 @@
-"""Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference"), and sensors in files of their own."""
+"""Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference")."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Self
 
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, describe, first_line
-from unitouch_gen.files import check_file, write_file
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
 
 Sensors = str | Sequence[str | None] | None
 """A name for all images, one for each, or `None` to retrieve them."""
@@ -134,89 +129,3 @@ class SensorBank(nn.Module):
             parts.append(encoder(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
             order += rows
         return torch.cat(parts)[torch.tensor(order).argsort()]
-
-    def without(self, name: str) -> "SensorBank":
-        """Another bank of the same sensors but one; this one stays as it is: threads may be using it."""
-        rows = [row for row, other in enumerate(self.names) if other != name]
-        reaches = {other: reach for other, reach in self.reaches.items() if other != name}
-        _, count, width = self.tokens.shape
-        bank = SensorBank([self.names[row] for row in rows], count, width, self.prototype_size, reaches)
-        bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[rows], self.prototypes[rows], self.known[rows]
-        return bank.requires_grad_(self.tokens.requires_grad)
-
-    def with_added(self, sensor: "AddedSensor", encoder: nn.Module) -> "SensorBank":
-        """Another bank with a new sensor behind the others, where it was made for this touch encoder."""
-        bank, base = self.without(sensor.name), fingerprint(encoder)
-        brought = f"`file` brings the sensor {sensor.name!r}"
-        if sensor.base.shape != base.shape or bool(((sensor.base - base).abs() > 0.015).any()):
-            raise InvalidInputError(f"{brought} of another touch encoder than this model's; adapt it to this one.")
-        try:
-            bank.tokens.data = torch.cat([bank.tokens.data, sensor.tokens[None].to(bank.tokens)])
-            bank.prototypes = torch.cat([bank.prototypes, sensor.prototype.flatten()[None].to(bank.prototypes)])
-        except RuntimeError as error:  # other sizes
-            raise InvalidInputError(f"{brought}, which does not fit ({first_line(error)}); adapt it anew.") from error
-        if bank.reaches:
-            bank.reaches[sensor.name] = max(bank.reaches.values()) if sensor.reach is None else sensor.reach
-        bank.names, bank.known = (*bank.names, sensor.name), torch.cat([bank.known, bank.known.new_ones(1)])
-        return bank
-
-
-# Sensors that were added ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class AddedSensor:
-    """A sensor that a touch encoder was not trained with: what `unitouch-gen adapt` learns.
-
-    Attributes:
-        name: To call it by.
-        base: `fingerprint` of the touch encoder that it was made for.
-        tokens: (L, width); L is 0 for an encoder without sensor tokens.
-        prototype: Mean raw image, in [0, 1], (3, S, S).
-        reach: As in `SensorBank.reaches`; the widest of the others' if left out.
-    """
-
-    name: str
-    base: Tensor
-    tokens: Tensor
-    prototype: Tensor
-    reach: float | None = None
-
-    def save(self, file: Path) -> None:
-        """Writes it in half precision; raises an `InvalidInputError` if the file cannot be written."""
-        parts = {"tokens": self.tokens, "prototype": self.prototype}
-        tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
-        metadata = {"kind": "unitouch sensor 1", "name": self.name}
-        metadata |= {} if self.reach is None else {"reach": repr(self.reach)}
-        write_file("output", file, save({**tensors, "base": self.base}, metadata))
-
-    @classmethod
-    def read(cls, file: Path) -> Self:
-        """Reads what `save` wrote; raises an `InvalidInputError` if it is no such file, or not finite."""
-        check_file("file", file, "a sensor")
-        try:
-            with safe_open(file, framework="pt") as stored:
-                known = stored.metadata() or {}
-                tensors = {key: check_finite(key, stored.get_tensor(key).float()) for key in stored.keys()}  # noqa: SIM118
-            base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
-            if tensors:
-                raise ValueError(f"it holds {next(iter(tensors))}, an update of the encoder; adapt the sensor anew")
-            return cls(known["name"], base, tokens, prototype, float(known["reach"]) if "reach" in known else None)
-        except (OSError, ValueError, KeyError, SafetensorError) as error:
-            raise InvalidInputError(
-                f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass what `adapt` wrote."
-            ) from error
-
-
-def fingerprint(encoder: nn.Module) -> Tensor:
-    """Logarithmic norm of the first 4096 values of each tensor, and a random projection over it, (tensors, 2).
-
-    Weights that change by a hundredth of themselves change it by more than 0.015; rounding to any precision does not.
-    """
-    found = []
-    for number, tensor in enumerate(encoder.state_dict().values()):
-        values = tensor.detach().flatten()[:4096].double().cpu()
-        direction = torch.randn(len(values), generator=torch.Generator().manual_seed(number), dtype=torch.float64)
-        norm = values.norm().clamp_min(1e-3)
-        found.append(torch.stack([norm.log(), values @ direction / norm]))
-    return torch.stack(found).float()

@@ -20,7 +20,7 @@ from unitouch_gen.training.data.heldout import of_datasets, of_world, parts_of
 def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cache: Path, monkeypatch):
     monkeypatch.setattr(heldout, "OBJECTS", 1)
     monkeypatch.setattr(heldout, "CONTACTS", 1)
-    for number, sensor in enumerate(model.sensors):
+    for number, sensor in enumerate(model.config.sensors):
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3 + 0.2 * number))
     (name, known, seed, splits), (other, strange, *_) = of_world(
         cache, model, processor, ["digit"], [1], 1, grasps=True
@@ -58,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp_path):
-    for sensor in model.sensors:
+    for sensor in model.config.sensors:
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3))
     data = open_dataset(folder)
     [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
