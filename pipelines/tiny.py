@@ -1,6 +1,5 @@
 """Pipelines of the built-in tiny family; components they share are stored once."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +83,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
                 "text_encoder": joint.text_model.text_model.eval(),
             }
         pipe = kind(**parts)
-    pipe._card = _card(family, name)
+        pipe._card = _card(family, name)
     return pipe
 
 
@@ -106,39 +105,12 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-SHOWN = {  # caption of a model card's picture; what its figures measure
-    "touch-to-image": ("Unseen touches, and below each the picture generated from it, of invented colours.", "picture"),
-    "stylization": ("Photos, touches of other materials, and the photos restyled by them.", "photo"),
-    "x-to-touch": ("Photos of unseen objects, and below each the touch generated from it.", "touch"),
-    "touch-to-text": ("", "answer"),
-}
-
-
-CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
-"""What stands beside a figure."""
-
-
 def _card(family: Path, name: str) -> Card:
-    """The model card of a family's pipeline: measured figures and, if built in, its training data."""
-    caption, made = SHOWN[name]
+    """The model card that the family's `family.json` describes, or a plain one."""
     file = family / weights.FIGURES.name
-    held = read_settings("family", file) if file.is_file() else {}
-    rows = held.get("figures", {}).get("quality", {}).get("rows", {})
-    told = (
-        rf"(\w+ to )?{made}: (material|contact within material|grain|grain within 20|hard or soft|contact place|grasp)"
-    )
-    figures = {}
-    for key, row in rows.items():
-        if re.fullmatch(told, key):
-            beside = [f"{words} {row[name]:.1%}" for name, words in CONTROLS.items() if row[name] is not None]
-            figures[key] = f"{row['value']:.1%} ({', '.join(beside)})"
-    if family.resolve() != weights.FAMILY.resolve():
-        return Card(figures=figures)
-    return Card(
-        figures=figures,
-        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
-        "recording of a real sensor.",
-        license="apache-2.0",
-        limits="It is small and knows a procedural world; of real touches it says little.",
-        pictures={caption: weights.CARDS / f"{name}.jpg"} if caption else {},
-    )
+    cards = read_settings("family", file).get("cards", {}) if file.is_file() else {}
+    settings = dict(cards.get(name, {}))
+    pictures = {
+        caption: family / weights.CARDS.name / stored for caption, stored in settings.pop("pictures", {}).items()
+    }
+    return Card(**settings, pictures=pictures)

@@ -1,9 +1,9 @@
 """`python -m tests.benchmarks`: the figures of tables in README.md and docs/, measured on the held-out split.
 
     python -m tests.benchmarks --write
-        also stores them in unitouch_gen/weights/family.json and between the marks on the pages
+        also stores them in unitouch_gen/weights/family.json, for model cards, too, and between the marks on the pages
     python -m tests.benchmarks --write --only
-        measures nothing, and writes what is stored to the pages
+        measures nothing, and writes what is stored to the pages and model cards
     python -m tests.benchmarks --only quality --recordings FOLDER --photos FOLDER
         what the family is worth on the world and on real touches
 
@@ -21,7 +21,7 @@ from rich.console import Console
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures, in_turns, machine, quiet, seconds_of
 from tests.benchmarks.quality import quality_figures
-from tests.benchmarks.tables import write_pages
+from tests.benchmarks.tables import card_settings, write_pages
 from tests.benchmarks.world import world_figures
 from unitouch_gen import example, weights
 from unitouch_gen.files import write_file
@@ -70,6 +70,8 @@ def main() -> None:
         if given.write:  # at once, as the next one takes minutes
             write_file("figures", weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
     if given.write:
+        family |= {"figures": figures, "cards": card_settings(figures)}
+        write_file("figures", weights.FIGURES, json.dumps(family, indent=2) + "\n")
         write_pages(figures)
 
 

@@ -1,4 +1,4 @@
-"""Tables of README.md and docs/, between two comments of a name, such as `<!-- summary -->`.
+"""Tables of README.md and docs/, between two comments of a name, such as `<!-- summary -->`, and model cards.
 
 Other figures that the pages quote are in `family.json`, and printed.
 """
@@ -198,6 +198,52 @@ def answers_table(figures: Figures) -> str:
     head = ["right in answers", "touch (spread)", "picture", "another's touch", "most frequent answer"]
     return table(head, rows)
 
+
+# Model cards ----------------------------------------------------------------------------------------------------------
+
+CARDS = {
+    "touch-to-image": ("touch to picture",),
+    "stylization": (),
+    "x-to-touch": ("touch", "photo to touch", "caption to touch", "sound to touch", "word to touch"),
+    "touch-to-text": ("answer",),
+}
+"""What the figures of a built-in pipeline's card measure."""
+
+ON_CARDS = (
+    "material", "contact within material", "grain", "grain within 20", "hard or soft", "contact place", "grasp",
+)  # fmt: skip
+"""Ends of the names of these figures."""
+
+DRAWN = {
+    "touch-to-image": "Unseen touches, and below each the picture generated from it, of invented colours.",
+    "stylization": "Photos, touches of other materials, and the photos restyled by them.",
+    "x-to-touch": "Photos of unseen objects, and below each the touch generated from it.",
+}
+"""What the picture of a card shows."""
+
+
+def card_settings(figures: Figures) -> dict[str, dict[str, Any]]:
+    """Arguments of `Card` by built-in pipeline; pictures are names of files in the family's `cards`."""
+    cards = {}
+    for pipeline, measured in CARDS.items():
+        told = {}
+        for name, row in figures["quality"]["rows"].items():
+            what, _, end = name.partition(": ")
+            if what in measured and end in ON_CARDS:
+                controls = [f"{words} {row[key]:.1%}" for key, words in CONTROLS.items() if row[key] is not None]
+                told[name] = f"{row['value']:.1%} ({', '.join(controls)})"
+        cards[pipeline] = {
+            "figures": told,
+            "data": "The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders "
+            "itself; no recording of a real sensor.",
+            "license": "apache-2.0",
+            "limits": "It is small and knows a procedural world; of real touches it says little.",
+            "pictures": {DRAWN[pipeline]: f"{pipeline}.jpg"} if pipeline in DRAWN else {},
+        }
+    return cards
+
+
+# Pages ----------------------------------------------------------------------------------------------------------------
 
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,

@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_iter
 from tests.benchmarks import quality
 from tests.benchmarks.error_and_time import cost_figures, our_call, speedup_figures, usual_call
 from tests.benchmarks.files_entered import functions_entered
-from tests.benchmarks.tables import MARKS, ROOT, write_pages
+from tests.benchmarks.tables import MARKS, ROOT, card_settings, write_pages
 from tests.benchmarks.world import physics_figures
 from tests.helpers.components import make_components
 from unitouch_gen import weights
@@ -103,10 +103,12 @@ def test_the_built_in_joint_space_is_beside_its_controls(tmp_path):
 # Pages ----------------------------------------------------------------------------------------------------------------
 
 
-def test_stored_figures_fill_the_marks_of_all_pages(tmp_path):
+def test_stored_figures_fill_the_marks_of_all_pages_and_the_cards(tmp_path):
     shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("_build"))
     shutil.copy(ROOT / "README.md", tmp_path)
-    write_pages(json.loads(weights.FIGURES.read_text())["figures"], tmp_path)
+    family = json.loads(weights.FIGURES.read_text())
+    assert family["cards"] == card_settings(family["figures"])
+    write_pages(family["figures"], tmp_path)
     pages = "".join(page.read_text() for page in [tmp_path / "README.md", *(tmp_path / "docs").rglob("*.md")])
     assert all(pages.count(f"<!-- {mark} -->") == 2 for mark in MARKS)
 

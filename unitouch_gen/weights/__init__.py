@@ -4,7 +4,8 @@ Layout: `joint/` is the space of all four modalities with its processor, `embedd
 those of other modalities are moved towards, `image-vae/` the autoencoder of pictures, `touch-vae/` that of touch
 images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only pipelines of this kind have.
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
-model cards, and `family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
+model cards, and `family.json` holds figures, what the cards say, seeds, times and recipes. Every tensor is stored once,
+in fp16.
 """
 
 from pathlib import Path
