@@ -90,12 +90,12 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         if name in TURBO:
             parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
             parts |= {"default_num_inference_steps": 4, "default_guidance_scale": 1.0}
-        pipe = kind(**parts)
-        if name in TURBO:
             needed("peft")
-            pipe.load_lora_weights(folder / "turbo")
-            pipe.fuse_lora()  # into the network's weights: nothing more to compute, and saved with them
-            pipe.unload_lora_weights()
+            # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
+            parts["unet"].load_lora_adapter(folder / "turbo", prefix="unet", use_safetensors=True)
+            parts["unet"].fuse_lora()  # into the network's own weights: nothing more to compute, and saved with them
+            parts["unet"].unload_lora()
+        pipe = kind(**parts)
     pipe._card = _card(family, name)
     return pipe
 

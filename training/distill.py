@@ -7,14 +7,14 @@ it says at one level is held to what it says one step of DDIM further. It leaves
 `LCMScheduler` of diffusers and called with a `guidance_scale` of 1, since guidance is part of what it has learnt.
 """
 
-from pathlib import Path
+import warnings
 from typing import Annotated, Any
 
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
@@ -43,7 +43,8 @@ class DistillSettings(Settings):
     """How the student is taught."""
 
     guidance_spread: Share  # the scale is uniform around the pipeline's default, by up to this share of it
-    solver_steps: Annotated[int, Field(ge=2, le=1000)]  # of DDIM from noise to data; `original_inference_steps` of LCM
+    solver_steps: Annotated[int, Field(ge=2, le=1000)]  # levels from noise to data; LCM's `original_inference_steps`
+    skip: PositiveInt  # of these levels, how many a step of DDIM goes over
     target_decay: Decay  # of the moving average of the LoRA layers that the student is held to
     huber: PositiveFloat  # c of the pseudo-Huber loss
 
@@ -54,7 +55,7 @@ class DistillRecipe(Recipe):
 
 
 class DistillObjective(nn.Module):
-    """Consistency of neighbouring states on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
+    """Consistency of states a step apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
 
     One network is all three: without LoRA layers the teacher, with those of `STUDENT` what is trained, with those of
     `TARGET` what it is held to. `conditioned` is the objective that the network was trained by, for its conditions.
@@ -79,7 +80,9 @@ class DistillObjective(nn.Module):
         latents, settings = batch["latents"].float(), self.settings
         count, device = len(latents), latents.device
         step = torch.randint(1, len(self.timesteps), (count,))
-        (t, sigma), (t_next, sigma_next) = (self._level(at, device) for at in (step, step - 1))
+        (t, sigma), (t_next, sigma_next) = (
+            self._level(at, device) for at in (step, (step - settings.skip).clamp(min=0))
+        )
         every = torch.ones(count, dtype=torch.bool, device=device)
         conditions = self.frozen[0].conditions(batch, every)
         unconditional = self.frozen[0].conditions(batch, ~every)
@@ -129,29 +132,35 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
     """Gives a network the LoRA layers of the student, which alone are trained, and of the target."""
     config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
     unet.requires_grad_(False)
-    for name in (TARGET, STUDENT):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
         try:
-            unet.add_adapter(config, name)
+            unet.add_adapter(config, TARGET)
+            unet.add_adapter(config, STUDENT)
         except ValueError as error:  # no such modules
             raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
     unet.set_adapter(STUDENT)
 
 
-def conditioned_touches(stage: Stage, settings: Arguments, *networks: Any) -> tuple[Conditioned, ArrayDataset]:
+def conditioned_touches(
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+) -> tuple[Conditioned, ArrayDataset]:
     """What a network of touches was trained on: its objective, and the data."""
     with reading("model", stage.folders["model"]):
         joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
-    config, sensors = networks[0].config, settings["sensors"]
+    config, sensors = unet.config, settings["sensors"]
     with_gels = config.in_channels != config.out_channels
     for source in stage.sources:
         if source.sensor is not None or not with_gels:
             check_choice("data: sensor", source.sensor, sensors)
     dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
     how = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
-    return touch_ldm.TouchDiffusionObjective(*networks, joint.config.embedding_norm, how, gels), dataset
+    return touch_ldm.TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, how, gels), dataset
 
 
-def conditioned_pictures(stage: Stage, settings: Arguments, *networks: Any) -> tuple[Conditioned, ArrayDataset]:
+def conditioned_pictures(
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+) -> tuple[Conditioned, ArrayDataset]:
     """The same of a network of pictures."""
     folder = stage.folders["model"]
     with reading("model", folder):
@@ -162,7 +171,7 @@ def conditioned_pictures(stage: Stage, settings: Arguments, *networks: Any) -> t
         processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
     dataset, captions = unclip.inputs(stage, joint, vae)
     how = read(unclip.UnclipSettings, read_recipe("unclip")["objective"])
-    return unclip.UnclipObjective(*networks, how, normalizer, noising, captions, processor, text_encoder), dataset
+    return unclip.UnclipObjective(unet, scheduler, how, normalizer, noising, captions, processor, text_encoder), dataset
 
 
 CONDITIONED = {

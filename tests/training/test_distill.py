@@ -20,7 +20,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(guidance_spread=0.0, solver_steps=50, target_decay=0.5, huber=1e-3)
+SETTINGS = DistillSettings(guidance_spread=0.0, solver_steps=50, skip=1, target_decay=0.5, huber=1e-3)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 
@@ -77,7 +77,9 @@ def test_steps_and_what_is_held_to_are_those_of_diffusers(kind: str) -> None:
             (t, sigma), (_, sigma_next) = (objective._level(torch.tensor([at, at]), "cpu") for at in (place, place - 1))
             prediction = unet(z, t, **conditions).sample
             step = ddim.step(prediction, t[0], z)
-            assert_close(ddim_step(step.pred_original_sample, z, sigma, sigma_next), step.prev_sample, atol=1e-4, rtol=0)
+            assert_close(
+                ddim_step(step.pred_original_sample, z, sigma, sigma_next), step.prev_sample, atol=1e-4, rtol=0
+            )
             lcm._step_index = None
             found = lcm.step(prediction, t[0], z).denoised
             assert_close(objective._consistency(z, t, sigma, conditions), found, atol=1e-4, rtol=1e-4)
@@ -121,14 +123,18 @@ def distil(teacher: Path, output: Path, cache: Path, *words: str) -> None:
 
 
 @pytest.mark.parametrize("name", PIPELINES)
-def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(name: str, cache: Path, tmp_path: Path) -> None:
+def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
+    name: str, cache: Path, tmp_path: Path
+) -> None:
     pipe = quiet(make_pipelines()[name])
     pipe.save_pretrained(tmp_path / "teacher")
     distil(tmp_path / "teacher", tmp_path / "run", cache)
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (checkpoints_in(tmp_path / "again")[-1] / "progress.json").unlink()
     distil(tmp_path / "teacher", tmp_path / "again", cache, "--resume")
-    layers, again = (load_file(tmp_path / run / "model" / "pytorch_lora_weights.safetensors") for run in ("run", "again"))
+    layers, again = (
+        load_file(tmp_path / run / "model" / "pytorch_lora_weights.safetensors") for run in ("run", "again")
+    )
     assert layers.keys() == again.keys() and all(torch.equal(again[key], value) for key, value in layers.items())
     assert {value.dtype for value in layers.values()} == {torch.float16}
     assert any(bool(value.abs().max() > 0) for key, value in layers.items() if "lora_B" in key or ".up." in key)
@@ -169,7 +175,7 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
     shutil.rmtree(broken / "unet")
     for folder, words, message in (
         ("gone", "", "'--model'"),
-        ("empty", "", "`model` is "),
+        ("empty", "", "`model` names "),
         ("other", "", "is 'StableDiffusionPipeline'; it has to be one of"),
         ("broken", "", "`model` is "),
         ("teacher", "--set lora.target_modules=[to_p]", "`lora` does not fit the network"),
