@@ -52,6 +52,8 @@ BAD = {
         ("classify in/dark.png --template feels", "`template`"),
         ("adapt in --sensor mine --steps 0", "--steps"),
         ("doctor --device meta", "`--device` is 'meta'"),
+        ("distill --model in -o out", "`model` names 'in/model_index.json', which does not exist"),
+        ("distill --model in -o out --set steps=3", "`set` is 'steps=3'"),
     ],
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
