@@ -4,13 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import AutoTokenizer, LlamaForCausalLM
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
-from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, needed
 from unitouch_gen.files import as_path, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import stored_class
@@ -30,12 +30,16 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
 FOLDERS = {"stylization": "touch-to-image"}
 """Of what only some pipelines have, where it is not the pipeline's name."""
 
+TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
+"""Pipelines in four evaluations, without guidance: another's, with the LoRA weights in its folder `turbo`."""
+
 
 def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "x-to-touch", "stylization" or "touch-to-text".
+        name: "touch-to-image", "x-to-touch", "stylization" or "touch-to-text"; "touch-to-image-turbo" and
+            "x-to-touch-turbo" draw in four evaluations, and need peft.
         dtype: dtype of the networks; the solver's state is always float32.
         family: Another folder of the same layout, such as one of your own training.
 
@@ -47,9 +51,9 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         >>> pipe.unet.config.sample_size
         16
     """
-    kind = PIPELINES[check_choice("name", name, PIPELINES)]
-    dtype, family = check_dtype("dtype", dtype), _family(family)
-    folder = family / FOLDERS.get(name, name)
+    teacher = TURBO.get(check_choice("name", name, [*PIPELINES, *TURBO]), name)
+    kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
+    folder = family / FOLDERS.get(teacher, teacher)
 
     def stored(part: Any, place: Path) -> Any:
         made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
@@ -82,6 +86,14 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
                 "tokenizer": processor.tokenizer,
                 "text_encoder": joint.text_model.text_model.eval(),
             }
+        if name in TURBO:
+            parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
+            parts |= {"default_num_inference_steps": 4, "default_guidance_scale": 1.0}
+            needed("peft")
+            # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
+            parts["unet"].load_lora_adapter(folder / "turbo", prefix="unet", use_safetensors=True)
+            parts["unet"].fuse_lora()  # into the network's own weights: nothing more to compute, and saved with them
+            parts["unet"].unload_lora()
         pipe = kind(**parts)
         pipe._card = _card(family, name)
     return pipe

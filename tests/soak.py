@@ -188,6 +188,7 @@ COMMANDS = {
     "touch-to-image": "in/a.png -o out", "stylize": "in/a.png in/a.png -o out", "x-to-touch": "--text brick -o out",
     "batch": "table.csv -o out", "classify": "in/a.png --labels wood,glass",
     "convert unitouch": "--touch in/a.png -o out", "data check": "in", "stability": "--list",
+    "distill": "--model in -o out",
 }  # fmt: skip
 
 

@@ -38,6 +38,14 @@ def gathered(rows: Tensor) -> Tensor:
     return torch.cat(all_gather(rows)) if several else rows
 
 
+def predict(
+    unet: UNet2DConditionModel, noisy: Tensor, steps: Tensor, extra_channels: Tensor | None = None, **conditions: Tensor
+) -> Tensor:
+    """What the network predicts at noisy latents (B, C, h, w), of the same shape, shown extra channels beside them."""
+    inputs = noisy if extra_channels is None else torch.cat([noisy, extra_channels], dim=1)
+    return unet(inputs, steps, **conditions).sample.float()
+
+
 def denoising_losses(
     unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, snr_gamma: float,
     extra_channels: Tensor | None = None, **conditions: Tensor,
@@ -65,8 +73,7 @@ def denoising_losses(
     noise = torch.randn_like(latents)
     noisy = scheduler.add_noise(latents, noise, steps)
     target = noise if kind == "epsilon" else scheduler.get_velocity(latents, noise, steps)
-    inputs = noisy if extra_channels is None else torch.cat([noisy, extra_channels], dim=1)
-    prediction = unet(inputs, steps, **conditions).sample.float()
+    prediction = predict(unet, noisy, steps, extra_channels, **conditions)
     snr = compute_snr(scheduler, steps)
     bounded = snr.clamp(0.0 if kind == "epsilon" else min(1.0, snr_gamma), snr_gamma)
     weight = bounded / (snr if kind == "epsilon" else snr + 1.0)

@@ -51,6 +51,9 @@ STAGES: dict[str, dict[str, str]] = {
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
+NEEDS = {**STAGES, "distill": {"model": "pipeline"}}
+"""The same, and of what no family is made of: distillation takes a saved pipeline."""
+
 
 class Recipe(Settings):
     """The sections that all stages have."""
@@ -79,6 +82,7 @@ class Stage:
         vae: Annotated[Path | None, Option(exists=True, help="Folder of the autoencoder to build on.")] = None,
         llama: Annotated[Path | None, Option(exists=True, help="Folder of the language model to build on.")] = None,
         init: Annotated[Path | None, Option(exists=True, help="Folder of weights to start from.")] = None,
+        model: Annotated[Path | None, Option(exists=True, help="Folder of a saved pipeline to distil.")] = None,
     ):
         on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
         # The other processes wait for the main one, which renders, decodes and embeds.
@@ -94,9 +98,9 @@ class Stage:
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)
         self.trainer, self.data = self.recipe.trainer, self.recipe.data
-        folders = {"joint": joint, "vae": vae, "llama": llama, "init": init}
+        folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        needs = {*STAGES[name]}
+        needs = {*NEEDS[name]}
         if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
             wanted = command_of(name, Path("runs"))
@@ -116,7 +120,9 @@ class Stage:
 
     @cached_property
     def processor(self) -> UniTouchProcessor:
-        """That of the joint space, or of the weights to start from; else what the recipe says."""
+        """That of the pipeline, the joint space, or the weights to start from; else what the recipe says."""
+        if "model" in self.folders:
+            return UniTouchProcessor.from_pretrained(self.folders["model"] / "processor")
         init = self.folders.get("init")
         if init is not None and not (init / "preprocessor_config.json").is_file():
             init = None  # an autoencoder or a UNet
@@ -125,7 +131,8 @@ class Stage:
         return UniTouchProcessor(image_size=self.data.image_size, audio=self.data.audio)  # type: ignore[arg-type]
 
     def joint_space(self, *modalities: str) -> UniTouchModel:
-        return UniTouchModel.from_pretrained(self.folders["joint"], modalities=modalities)
+        folder = self.folders["model"] / "unitouch" if "model" in self.folders else self.folders["joint"]
+        return UniTouchModel.from_pretrained(folder, modalities=modalities)
 
     def unet(self, model: Arguments, **conditions: Any) -> UNet2DConditionModel:
         """The network: random by the recipe and `conditions`, or the weights that were named to start from."""
@@ -196,7 +203,7 @@ class Stage:
 
 def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in NEEDS[name].items()]
     return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 

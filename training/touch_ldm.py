@@ -13,6 +13,7 @@ named ones.
 
 import json
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,8 @@ from torch import Tensor, nn
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models.autoencoders import read_autoencoder
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, sensor_numbers
 from unitouch_gen.training.data.columns import as_bytes
@@ -70,16 +72,23 @@ class TouchDiffusionObjective(nn.Module):
         self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        embeds, latents, settings = batch["image_embeds"].float(), batch["latents"].float(), self.settings
+        latents, settings = batch["latents"].float(), self.settings
+        kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
+        conditions = self.conditions(batch, kept)
+        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
+
+    def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
+        """What the network is told of each sample; where `kept` (B,) is false, what guidance calls unconditional."""
+        embeds, settings = batch["image_embeds"].float(), self.settings
         (count, width), device = embeds.shape, embeds.device
         size = settings.condition_noise * torch.rand(count, 1, device=device)
         size = size * (torch.rand(count, 1, device=device) < settings.noisy_share)
         noisy = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
-        kept = torch.rand(count, 1, device=device) >= settings.condition_dropout
-        condition = match_norm(noisy, self.embedding_norm) * kept
-        extra = None if self.backgrounds is None else self.backgrounds[batch["background"].cpu()].to(latents)
+        condition = match_norm(noisy, self.embedding_norm) * kept[:, None]
         conditions = {"encoder_hidden_states": condition[:, None], "class_labels": batch["sensor"]}
-        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, extra, **conditions)
+        if self.backgrounds is not None:
+            conditions["extra_channels"] = self.backgrounds[batch["background"].cpu()].to(embeds)
+        return conditions
 
 
 def class_labels(splits: Sequence[Rendered], sensors: Sequence[str]) -> np.ndarray:
@@ -92,6 +101,40 @@ def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
     """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
     starts = np.cumsum([0, *(2 * -(-len(split) // GROUP) for split in splits)])
     return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
+
+
+def inputs(
+    stage: Stage, joint: UniTouchModel, vae: Autoencoder, sensors: Sequence[str], with_gels: bool
+) -> tuple[ArrayDataset, Tensor | None]:
+    """Columns of touches' latents, their pictures' embeddings, sensors and, with gels, the places of their backgrounds.
+
+    `sensors` are the names of the class labels. With gels, the latents (M, C, h, w) of all backgrounds are returned.
+    """
+    splits = stage.splits("image", "touch", "sensor")
+    embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
+
+    def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
+        return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
+
+    columns = {
+        "latents": latents_of("touch", [split.touch for split in splits]),
+        "image_embeds": embeds,
+        "sensor": torch.from_numpy(class_labels(splits, sensors)),
+    }
+    if not with_gels:
+        return ArrayDataset(**columns), None
+    drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
+    gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in drawn)  # (2 G, 3, S, S)
+    columns["background"] = torch.from_numpy(np.concatenate(places_of(splits)))
+    # Each contact is learnt by its second sensor as well, which has no name.
+    others = {
+        "latents": latents_of("second", [split.second for split in splits if split.second is not None]),
+        "image_embeds": embeds,
+        "sensor": torch.full_like(columns["sensor"], len(sensors)),
+        "background": columns["background"] + 1,
+    }
+    columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
+    return ArrayDataset(**columns), latents_of("untouched", gels)
 
 
 def main(stage: Stage) -> None:
@@ -113,32 +156,10 @@ def main(stage: Stage) -> None:
         )
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
 
-    splits = stage.splits("image", "touch", "sensor")
-    embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
-
-    def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
-        return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
-
-    columns = {
-        "latents": latents_of("touch", [split.touch for split in splits]),
-        "image_embeds": embeds,
-        "sensor": torch.from_numpy(class_labels(splits, sensors)),
-    }
-    table, places = None, list[np.ndarray]()
-    if with_gels:
-        gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in drawn)  # (2 G, 3, S, S)
-        table, places = latents_of("untouched", gels), places_of(splits)
-        columns["background"] = torch.from_numpy(np.concatenate(places))
-        # Each contact is learnt by its second sensor as well, which has no name.
-        others = {
-            "latents": latents_of("second", [split.second for split in splits if split.second is not None]),
-            "image_embeds": embeds,
-            "sensor": torch.full_like(columns["sensor"], len(sensors)),
-            "background": columns["background"] + 1,
-        }
-        columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
+    dataset, table = inputs(stage, joint, vae, sensors, with_gels)
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, recipe.objective, table)
-    stage.fit(objective, ArrayDataset(**columns))
+    stage.fit(objective, dataset)
+    embeds: Any = dataset.columns["image_embeds"][: len(dataset) // (1 + with_gels)]  # those of first sensors
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[: recipe.embedding_bank.size]
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
@@ -146,8 +167,8 @@ def main(stage: Stage) -> None:
         EmbeddingBank.of(embeds[rows]).save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
         if table is not None and sensors:
-            named = [split.sensor for split in splits]
-            own = [int(places[named.index(name)][0]) for name in sensors]
+            labels, places = (np.asarray(dataset.columns[name]) for name in ("sensor", "background"))
+            own = [int(places[labels == label][0]) for label in range(len(sensors))]
             SensorBackgrounds.of(table[own]).save_pretrained(folder / "backgrounds")
 
 

@@ -5,7 +5,7 @@
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
 
-from typing import Self
+from typing import Any, Self
 
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import UniTouchProcessor
-from unitouch_gen.models.autoencoders import read_autoencoder
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
@@ -64,9 +64,15 @@ class UnclipObjective(nn.Module):
         self.noising, self.captions, self.processor = noising, captions, processor
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        latents, embeds = batch["latents"].float(), batch["image_embeds"]
-        settings, count, device = self.settings, len(embeds), embeds.device
-        kept = torch.rand(count, device=device) >= settings.condition_dropout
+        latents, settings = batch["latents"].float(), self.settings
+        kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
+        conditions = self.conditions(batch, kept)
+        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
+
+    def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
+        """What the network is told of each sample; where `kept` (B,) is false, what guidance calls unconditional."""
+        embeds, settings = batch["image_embeds"], self.settings
+        count, device = len(embeds), embeds.device
         # Some are at level 0, where a picture's own embedding is used, the others at any level.
         noised = torch.rand(count, device=device) >= settings.clean_share
         level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
@@ -75,8 +81,7 @@ class UnclipObjective(nn.Module):
             gain * embeds, level, torch.randn_like(embeds), self.frozen[0], self.noising
         )  # (B, 2 D)
         hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
-        conditions = {"encoder_hidden_states": hidden, "class_labels": labels * kept[:, None]}
-        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
+        return {"encoder_hidden_states": hidden, "class_labels": labels * kept[:, None]}
 
     @torch.no_grad()
     def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
@@ -99,19 +104,25 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
-def main(stage: Stage) -> None:
-    recipe: UnclipRecipe = stage.recipe
-    joint = stage.joint_space("image", "text")
-    vae = read_autoencoder(stage.folders["vae"])
-    unet = stage.unet(recipe.model)
-    scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
+def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayDataset, list[str]]:
+    """Columns of pictures' latents, embeddings and numbers, and the caption of each picture."""
     splits = stage.splits("image", "text")
     embeds, captions = stage.image_embeddings(joint, splits), [caption for split in splits for caption in split.text]
     latents = cached_latents(vae, [split.image for split in splits], f"image-latents-{stage.key(splits)}", stage.cache)
+    return ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))), captions
+
+
+def main(stage: Stage) -> None:
+    recipe: UnclipRecipe = stage.recipe
+    joint = stage.joint_space("image", "text")
+    unet = stage.unet(recipe.model)
+    scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
+    dataset, captions = inputs(stage, joint, read_autoencoder(stage.folders["vae"]))
+    embeds: Any = dataset.columns["image_embeds"]
     normalizer, noising = fit_normalizer(embeds), DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     texts = (captions, stage.processor, joint.text_model.text_model)
     objective = UnclipObjective(unet, scheduler, recipe.objective, normalizer, noising, *texts)
-    stage.fit(objective, ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))))
+    stage.fit(objective, dataset)
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")

@@ -51,6 +51,8 @@ BAD = {
         ("classify in/dark.png --labels wood", "`labels`"),
         ("classify in/dark.png --template feels", "`template`"),
         ("doctor --device meta", "`--device` is 'meta'"),
+        ("distill --model in -o out", "`model` names 'in/model_index.json', which does not exist"),
+        ("distill --model in -o out --set steps=3", "`set` is 'steps=3'"),
     ],
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),

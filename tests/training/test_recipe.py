@@ -11,6 +11,7 @@ from transformers import ResNetConfig
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
+from unitouch_gen.training.distill import DistillRecipe
 from unitouch_gen.training.image_text import ImageTextRecipe
 from unitouch_gen.training.image_vae import AutoencoderRecipe, make_autoencoder
 from unitouch_gen.training.language_model import LanguageModelRecipe
@@ -27,7 +28,7 @@ KINDS: dict[str, type[Recipe]] = {
     "image_text": ImageTextRecipe, "audio": Recipe, "touch": TouchRecipe, "image_vae": AutoencoderRecipe,
     "unclip": UnclipRecipe, "picture_classifier": ClassifierRecipe, "touch_vae": AutoencoderRecipe,
     "touch_ldm": TouchDiffusionRecipe, "touch_classifier": ClassifierRecipe,
-    "language_model": LanguageModelRecipe, "touch_llm": TouchLLMRecipe,
+    "language_model": LanguageModelRecipe, "touch_llm": TouchLLMRecipe, "distill": DistillRecipe,
 }  # fmt: skip
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
 

@@ -15,6 +15,7 @@ from unitouch_gen.cli.batch import batch
 from unitouch_gen.cli.classify import classify
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
+from unitouch_gen.cli.distill import distill
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.numerics import stability, work_precision
@@ -41,7 +42,7 @@ def options(
 
 
 drawing = (touch_to_image, stylize, x_to_touch, batch, app)
-for function in (*drawing, ask, classify, evaluate, work_precision, stability, doctor):
+for function in (*drawing, ask, classify, distill, evaluate, work_precision, stability, doctor):
     commands.command()(function)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")

@@ -1,0 +1,205 @@
+"""A pipeline in four evaluations: LCM-LoRA (Luo et al., 2023), by latent consistency distillation.
+
+    python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
+
+A student, the network with LoRA layers, learns to say at any noise level what the guided network would arrive at: what
+it says at one level is held to what it says one step of DDIM further. It leaves a LoRA file, to be loaded with the
+`LCMScheduler` of diffusers and called with a `guidance_scale` of 1, since guidance is part of what it has learnt.
+"""
+
+import warnings
+from typing import Annotated, Any
+
+import torch
+from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers.loaders import StableDiffusionLoraLoaderMixin
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from pydantic import Field, PositiveFloat, PositiveInt
+from torch import Tensor, nn
+from transformers import CLIPTextModel
+
+from unitouch_gen.errors import InvalidInputError, check_choice, needed
+from unitouch_gen.files import read_settings, reading
+from unitouch_gen.models.autoencoders import read_autoencoder
+from unitouch_gen.models.processing import read_tokenizer
+from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
+from unitouch_gen.training import touch_ldm, unclip
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.losses import predict
+from unitouch_gen.training.recipe import Arguments, Settings, Share, build, read, read_recipe
+from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.trainer import Decay
+
+STUDENT, TARGET = "student", "target"
+"""Names of the two sets of LoRA layers: those that are trained, and their moving average."""
+
+SIGMA_DATA, TIMESTEP_SCALING = 0.5, 10.0
+"""Of the boundary condition, as in diffusers' `LCMScheduler`."""
+
+Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
+
+
+class DistillSettings(Settings):
+    """How the student is taught."""
+
+    guidance_spread: Share  # the scale is uniform around the pipeline's default, by up to this share of it
+    solver_steps: Annotated[int, Field(ge=2, le=1000)]  # levels from noise to data; LCM's `original_inference_steps`
+    skip: PositiveInt  # of these levels, how many a step of DDIM goes over
+    target_decay: Decay  # of the moving average of the LoRA layers that the student is held to
+    huber: PositiveFloat  # c of the pseudo-Huber loss
+
+
+class DistillRecipe(Recipe):
+    lora: Arguments
+    objective: DistillSettings
+
+
+class DistillObjective(nn.Module):
+    """Consistency of states a step apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
+
+    One network is all three: without LoRA layers the teacher, with those of `STUDENT` what is trained, with those of
+    `TARGET` what it is held to. `conditioned` is the objective that the network was trained by, for its conditions.
+    """
+
+    def __init__(
+        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, conditioned: Conditioned,
+        settings: DistillSettings, guidance_scale: float,
+    ):  # fmt: skip
+        super().__init__()
+        self.trained, self.settings, self.guidance_scale = unet, settings, guidance_scale
+        self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
+        self.prediction_type = scheduler.config.prediction_type
+        levels = scheduler.config.num_train_timesteps
+        steps = torch.arange(1, settings.solver_steps + 1) * (levels // settings.solver_steps) - 1
+        self.timesteps = torch.cat([torch.zeros(1, dtype=torch.long), steps])  # from data to noise
+        self.sigmas = NoiseSchedule.of(scheduler).sigma(self.timesteps).float()
+        self.follow(1.0)  # to begin with, they are alike
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        self.follow(1.0 - self.settings.target_decay)
+        latents, settings = batch["latents"].float(), self.settings
+        count, device = len(latents), latents.device
+        step = torch.randint(1, len(self.timesteps), (count,))
+        (t, sigma), (t_next, sigma_next) = (
+            self._level(at, device) for at in (step, (step - settings.skip).clamp(min=0))
+        )
+        every = torch.ones(count, dtype=torch.bool, device=device)
+        conditions = self.frozen[0].conditions(batch, every)
+        unconditional = self.frozen[0].conditions(batch, ~every)
+        spread = settings.guidance_spread * (2.0 * torch.rand(count, 1, 1, 1, device=device) - 1.0)
+        z = alpha(sigma) * (latents + sigma * torch.randn_like(latents))
+        with torch.no_grad():
+            self.trained.disable_adapters()
+            both = {name: torch.cat([unconditional[name], given]) for name, given in conditions.items()}
+            without, given = predict(self.trained, torch.cat([z, z]), torch.cat([t, t]), **both).chunk(2)
+            guided = without + self.guidance_scale * (1.0 + spread) * (given - without)
+            z_next = ddim_step(to_denoised(guided, z, sigma, self.prediction_type), z, sigma, sigma_next)
+            self.trained.enable_adapters()
+            self.trained.set_adapter(TARGET)
+            aim = self._consistency(z_next, t_next, sigma_next, conditions)
+        self.trained.set_adapter(STUDENT)
+        error = self._consistency(z, t, sigma, conditions) - aim
+        loss = ((error.square() + settings.huber**2).sqrt() - settings.huber).mean()
+        return {"loss": loss, "mse": error.square().mean().detach()}
+
+    @torch.no_grad()
+    def follow(self, share: float) -> None:
+        """Moves the target's layers towards the student's, by a share of the way."""
+        for name, parameter in self.trained.named_parameters():
+            if f".{TARGET}." in name:
+                student = self.trained.get_parameter(name.replace(f".{TARGET}.", f".{STUDENT}."))
+                parameter.lerp_(student, share)
+
+    def _level(self, at: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Timesteps (B,) and noise levels (B, 1, 1, 1)."""
+        return self.timesteps[at].to(device), self.sigmas[at].to(device)[:, None, None, None]
+
+    def _consistency(self, z: Tensor, t: Tensor, sigma: Tensor, conditions: dict[str, Tensor]) -> Tensor:
+        """f(z, t) = c_skip z + c_out x_0(z, t) (B, C, h, w), which is z at t = 0."""
+        denoised = to_denoised(predict(self.trained, z, t, **conditions), z, sigma, self.prediction_type)
+        scaled = TIMESTEP_SCALING * t[:, None, None, None]
+        c_skip, c_out = SIGMA_DATA**2 / (scaled**2 + SIGMA_DATA**2), scaled / (scaled**2 + SIGMA_DATA**2) ** 0.5
+        return c_skip * z + c_out * denoised
+
+
+def ddim_step(denoised: Tensor, z: Tensor, sigma: Tensor, sigma_next: Tensor) -> Tensor:
+    """The variance-preserving state at the next noise level (Song et al., 2021, "DDIM", Equation 12, eta 0)."""
+    noise = (z / alpha(sigma) - denoised) / sigma
+    return alpha(sigma_next) * (denoised + sigma_next * noise)
+
+
+def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
+    """Gives a network the LoRA layers of the student, which alone are trained, and of the target."""
+    config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
+    unet.requires_grad_(False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
+        try:
+            unet.add_adapter(config, TARGET)
+            unet.add_adapter(config, STUDENT)
+        except ValueError as error:  # no such modules
+            raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
+    unet.set_adapter(STUDENT)
+
+
+def conditioned_touches(
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+) -> tuple[Conditioned, ArrayDataset]:
+    """What a network of touches was trained on: its objective, and the data."""
+    with reading("model", stage.folders["model"]):
+        joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
+    config, sensors = unet.config, settings["sensors"]
+    with_gels = config.in_channels != config.out_channels
+    for source in stage.sources:
+        if source.sensor is not None or not with_gels:
+            check_choice("data: sensor", source.sensor, sensors)
+    dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
+    how = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
+    return touch_ldm.TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, how, gels), dataset
+
+
+def conditioned_pictures(
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+) -> tuple[Conditioned, ArrayDataset]:
+    """The same of a network of pictures."""
+    folder = stage.folders["model"]
+    with reading("model", folder):
+        joint, vae, processor = stage.joint_space("image"), read_autoencoder(folder / "vae"), stage.processor
+        normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", use_safetensors=True)
+        noising = DDPMScheduler.from_pretrained(folder / "image_noising_scheduler")
+        text_encoder = CLIPTextModel.from_pretrained(folder / "text_encoder", use_safetensors=True)
+        processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
+    dataset, captions = unclip.inputs(stage, joint, vae)
+    how = read(unclip.UnclipSettings, read_recipe("unclip")["objective"])
+    return unclip.UnclipObjective(unet, scheduler, how, normalizer, noising, captions, processor, text_encoder), dataset
+
+
+CONDITIONED = {
+    "TouchToImagePipeline": conditioned_pictures,
+    "TactileStylizationPipeline": conditioned_pictures,
+    "XToTouchPipeline": conditioned_touches,
+}
+
+
+def main(stage: Stage) -> None:
+    recipe: DistillRecipe = stage.recipe
+    folder = stage.folders["model"]
+    settings = read_settings("model", folder / "model_index.json")
+    kind = settings.get("_class_name")
+    kind = kind[-1] if isinstance(kind, list) else kind  # [module, class] on the Hub
+    conditioned_by = CONDITIONED[check_choice("model: _class_name", kind, CONDITIONED)]
+    with reading("model", folder):
+        unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
+        scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
+    add_layers(unet, recipe.lora)
+    conditioned, dataset = conditioned_by(stage, settings, unet, scheduler)
+    guidance_scale = settings["default_guidance_scale"]
+    stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
+    layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=TARGET)
+    with stage.saving() as place:
+        halves = {name: tensor.half() for name, tensor in layers.items()}
+        StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)
+
+
+if __name__ == "__main__":
+    run("distill", DistillRecipe, main)

@@ -1,0 +1,38 @@
+"""`unitouch-gen distill`: a pipeline in four evaluations."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option, echo
+
+from unitouch_gen.cli.loading import folder_of
+
+Overrides = Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Over the recipe.")]
+
+
+def distill(
+    model: Annotated[str, Option(help="Folder or repository id of a saved pipeline.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
+    recipe: Annotated[str, Option(help="A YAML file, or the name of a recipe of the package.")] = "distill",
+    overrides: Overrides = None,
+    cache: Annotated[Path, Option(help="What is rendered or decoded to learn from.")] = Path("runs/cache"),
+    resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
+) -> None:
+    """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (LCM-LoRA).
+
+    Example: unitouch-gen distill --model my-pipeline -o turbo --set 'data.sets=[{path: touches}]'
+    """
+    folder = folder_of(model)
+    import torch
+
+    from unitouch_gen.training.distill import DistillRecipe, main
+    from unitouch_gen.training.stages import Stage
+
+    stage = Stage(
+        "distill", DistillRecipe, model=folder, output=output, recipe=recipe, overrides=overrides, cache=cache,
+        resume=resume,
+    )  # fmt: skip
+    torch.manual_seed(stage.trainer.seed)
+    main(stage)
+    place = (output / "model").resolve()
+    echo(f"The weights are in {place}; use them by pipe.load_lora_weights(...) and diffusers' LCMScheduler")
