@@ -148,8 +148,7 @@ def conditioned_touches(
     """What a network of touches was trained on: its objective, and the data."""
     with reading("model", stage.folders["model"]):
         joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
-    config, sensors = unet.config, settings["sensors"]
-    with_gels = config.in_channels != config.out_channels
+    sensors, with_gels = settings["sensors"], unet.config.in_channels != unet.config.out_channels
     for source in stage.sources:
         if source.sensor is not None or not with_gels:
             check_choice("data: sensor", source.sensor, sensors)
@@ -182,8 +181,7 @@ CONDITIONED = {
 
 
 def main(stage: Stage) -> None:
-    recipe: DistillRecipe = stage.recipe
-    folder = stage.folders["model"]
+    recipe, folder = stage.recipe, stage.folders["model"]
     settings = read_settings("model", folder / "model_index.json")
     kind = settings.get("_class_name")
     kind = kind[-1] if isinstance(kind, list) else kind  # [module, class] on the Hub

@@ -7,14 +7,12 @@ from typer import Option, echo
 
 from unitouch_gen.cli.loading import folder_of
 
-Overrides = Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Over the recipe.")]
-
 
 def distill(
     model: Annotated[str, Option(help="Folder or repository id of a saved pipeline.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
     recipe: Annotated[str, Option(help="A YAML file, or the name of a recipe of the package.")] = "distill",
-    overrides: Overrides = None,
+    overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
     cache: Annotated[Path, Option(help="What is rendered or decoded to learn from.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
 ) -> None:
@@ -34,5 +32,4 @@ def distill(
     )  # fmt: skip
     torch.manual_seed(stage.trainer.seed)
     main(stage)
-    place = (output / "model").resolve()
-    echo(f"The weights are in {place}; use them by pipe.load_lora_weights(...) and diffusers' LCMScheduler")
+    echo(f"The weights are in {(output / 'model').resolve()}; use them by pipe.load_lora_weights(...), LCMScheduler")

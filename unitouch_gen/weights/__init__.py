@@ -2,8 +2,8 @@
 
 Layout: `joint/` is the space of all four modalities with its processor, `embedding-bank/` embeddings of pictures that
 those of other modalities are moved towards, `image-vae/` the autoencoder of pictures, `touch-vae/` that of touch
-images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only pipelines of this kind have.
-In `turbo/` of two of them is what makes their `-turbo` pipelines, LoRA weights.
+images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only pipelines of this kind have, and their
+`turbo/` the LoRA weights of `-turbo` ones.
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
 model cards, and `family.json` holds figures, what the cards say, seeds, times and recipes. Every tensor is stored once,
 in fp16.
