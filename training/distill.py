@@ -169,8 +169,9 @@ def conditioned_pictures(
         text_encoder = CLIPTextModel.from_pretrained(folder / "text_encoder", use_safetensors=True)
         processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
     dataset, captions = unclip.inputs(stage, joint, vae)
-    how = read(unclip.UnclipSettings, read_recipe("unclip")["objective"])
-    return unclip.UnclipObjective(unet, scheduler, how, normalizer, noising, captions, processor, text_encoder), dataset
+    how = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
+    parts = (read(unclip.UnclipSettings, how), normalizer, noising, captions, processor, text_encoder)
+    return unclip.UnclipObjective(*networks, *parts, settings["default_noise_level"]), dataset
 
 
 CONDITIONED = {

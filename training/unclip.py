@@ -50,16 +50,17 @@ class UnclipRecipe(Recipe):
 class UnclipObjective(nn.Module):
     """Denoising of latents, conditioned on an image embedding, noised by `normalizer` and `noising`, and a prompt.
 
-    Prompts are some of the samples' captions. Of the frozen text encoder only the hidden states are used.
+    Prompts are some of the samples' captions. Of the frozen text encoder only the hidden states are used. `level` is
+    that of the noise on embeddings, drawn if left out.
     """
 
     def __init__(
         self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, settings: UnclipSettings,
         normalizer: StableUnCLIPImageNormalizer, noising: DDPMScheduler, captions: list[str],
-        processor: UniTouchProcessor, text_encoder: nn.Module,
+        processor: UniTouchProcessor, text_encoder: nn.Module, level: int | None = None,
     ):  # fmt: skip
         super().__init__()
-        self.trained, self.scheduler, self.settings = unet, scheduler, settings
+        self.trained, self.scheduler, self.settings, self.level = unet, scheduler, settings, level
         self.frozen = (normalizer, text_encoder.eval())  # in a tuple, so that they are no modules of the objective
         self.noising, self.captions, self.processor = noising, captions, processor
 
@@ -73,9 +74,11 @@ class UnclipObjective(nn.Module):
         """What the network is told of each sample; where `kept` (B,) is false, what guidance calls unconditional."""
         embeds, settings = batch["image_embeds"], self.settings
         count, device = len(embeds), embeds.device
-        # Some are at level 0, where a picture's own embedding is used, the others at any level.
-        noised = torch.rand(count, device=device) >= settings.clean_share
-        level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
+        if self.level is None:  # some are at level 0, where a picture's own embedding is used, the others at any level
+            noised = torch.rand(count, device=device) >= settings.clean_share
+            level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
+        else:
+            level = torch.full((count,), self.level, device=device)
         gain = settings.gain + (1.0 - settings.gain) * torch.rand(count, 1, device=device)
         labels = noise_embeddings(
             gain * embeds, level, torch.randn_like(embeds), self.frozen[0], self.noising
