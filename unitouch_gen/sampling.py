@@ -141,27 +141,34 @@ def prepare_steps(
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
-    if tolerance is None:
-        if max_evaluations is not None:
-            raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
-        levels = config.get("num_train_timesteps", 1000)
-        whole = 50 if num_inference_steps is None else num_inference_steps
-        count = max(round(init_strength * check_integer("num_inference_steps", whole, 1, levels)), 1)
-        if solver is None:
-            return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
-    schedule, prediction_type = NoiseSchedule.of(scheduler), config.get("prediction_type")
-    check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
-    if tolerance is None:
-        solver = check_choice("solver", solver, SOLVERS)
-        sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
-        return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
-    for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
-        if value is not None:
-            raise InvalidInputError(f"`{name}` is {describe(value)}, but `tolerance` sets the steps; leave one out.")
-    check_number("tolerance", tolerance, 1e-5, 1.0)
-    limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
-    start = schedule.karras_level(1.0 - init_strength)
-    return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
+    if tolerance is not None:
+        for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
+            if value is not None:
+                raise InvalidInputError(
+                    f"`{name}` is {describe(value)}, but `tolerance` sets the steps; leave one out."
+                )
+        check_number("tolerance", tolerance, 1e-5, 1.0)
+        limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
+        schedule, prediction_type = trained_for(scheduler)
+        start = schedule.karras_level(1.0 - init_strength)
+        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
+    if max_evaluations is not None:
+        raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
+    whole = 50 if num_inference_steps is None else num_inference_steps
+    check_integer("num_inference_steps", whole, 1, config.get("num_train_timesteps", 1000))
+    count = max(round(init_strength * whole), 1)
+    if solver is None:
+        return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
+    schedule, prediction_type = trained_for(scheduler)
+    solver = check_choice("solver", solver, SOLVERS)
+    sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
+    return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
+
+
+def trained_for(scheduler: Any) -> tuple[NoiseSchedule, str]:
+    """The noise levels and the kind of prediction that a scheduler's network was trained for."""
+    schedule, prediction_type = NoiseSchedule.of(scheduler), scheduler.config.get("prediction_type")
+    return schedule, check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
 
 
 def prepare_scheduler(

@@ -90,7 +90,6 @@ def load_pipeline(
     """A pipeline, one of `CLASSES`, by a command's options: of a folder or repository, or built in."""
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
-    import torch
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
@@ -102,10 +101,6 @@ def load_pipeline(
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        if "OMP_NUM_THREADS" not in os.environ:
-            # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is
-            # busy, they wait for each other in every layer and take forty times as long.
-            torch.set_num_threads(1)
         pipe: Any = tiny(name, dtype=weights_dtype)
     else:
         folder = folder_of(model)
@@ -125,11 +120,25 @@ def load_joint_space(model: str | None, device: str) -> "tuple[UniTouchModel, Un
     from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
+    if model is None:
+        take_one_thread()
     folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
         joint, processor = folder / "unitouch", folder / "processor"
     with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
+
+
+def take_one_thread() -> None:
+    """One thread for built-in networks outside of pipelines' calls, which see to it themselves.
+
+    They are so small that more threads gain a tenth where the machine is idle; where it is busy, these wait for each
+    other in every layer and take forty times as long.
+    """
+    import torch
+
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
 
 
 def folder_of(model: str) -> Path:

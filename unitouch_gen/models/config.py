@@ -126,8 +126,7 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
-        ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
-            of earlier versions, and ignored.
+        ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
     """
 
@@ -154,9 +153,7 @@ class UniTouchConfig(PreTrainedConfig):
     embedding_norm: float | int = 1.0
 
     def __post_init__(self, **kwargs: Any) -> None:
-        # of the folder, and of earlier versions
-        for ignored in ("auto_map", "temperatures", "temperature_exponents", "logit_scales"):
-            kwargs.pop(ignored, None)
+        kwargs.pop("auto_map", None)  # of the folder
         super().__post_init__(**kwargs)
         self.sensors = list(self.sensors)
 
