@@ -224,9 +224,9 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
 
 
-def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:
-    """The place of each sample's sensor in `names`, int64 (N,): -1 where it has none, 0 where there are no names."""
-    numbers = [0 if not names else -1 if split.sensor is None else names.index(split.sensor) for split in splits]
+def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str]) -> np.ndarray:
+    """The place of each sample's sensor in `names`, int64 (N,); -1 where it has none."""
+    numbers = [names.index(split.sensor) if split.sensor in names else -1 for split in splits]
     return np.repeat(numbers, [len(split) for split in splits])
 
 

@@ -123,7 +123,7 @@ class SensorBank(nn.Module):
         """An encoder's output for pixel values with the tokens of their sensors, (B, ...); index -1 has none."""
         rows_of: dict[bool, list[int]] = {}
         for row, index in enumerate(indices.tolist()):
-            rows_of.setdefault(index >= 0 and bool(self.names), []).append(row)
+            rows_of.setdefault(index >= 0, []).append(row)
         parts, order = [], list[int]()
         for has_tokens, rows in rows_of.items():
             parts.append(encoder(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
