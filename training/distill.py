@@ -171,7 +171,7 @@ def conditioned_pictures(
     dataset, captions = unclip.inputs(stage, joint, vae)
     how = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
     parts = (read(unclip.UnclipSettings, how), normalizer, noising, captions, processor, text_encoder)
-    return unclip.UnclipObjective(*networks, *parts, settings["default_noise_level"]), dataset
+    return unclip.UnclipObjective(unet, scheduler, *parts, settings["default_noise_level"]), dataset
 
 
 CONDITIONED = {
