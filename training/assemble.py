@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from diffusers import DDPMScheduler, UniPCMultistepScheduler
+from diffusers import DDPMScheduler, DEISMultistepScheduler, UniPCMultistepScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
@@ -20,7 +20,7 @@ from unitouch_gen.training.stages import STAGES, command_of, run_command, weight
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
-TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 20,
+TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 12,
                   "default_noise_level": 250}  # fmt: skip
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
 
@@ -46,18 +46,23 @@ def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> None:
-    """What only one pipeline has: its networks, what it does by itself, and UniPC over the trained schedule.
+# Of diffusers' multistep schedulers and spacings, these do best in so many steps of the built-in networks.
+SCHEDULERS: dict[str, tuple[Any, dict[str, bool]]] = {
+    "touch-to-image": (DEISMultistepScheduler, {"use_karras_sigmas": True}),
+    "x-to-touch": (UniPCMultistepScheduler, {"use_exponential_sigmas": True}),
+}
 
-    Of diffusers' multistep schedulers and spacings, this one errs least in 20 steps of the built-in networks.
-    """
+
+def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> None:
+    """What only one pipeline has: its networks, what it does by itself, and a scheduler over the trained schedule."""
     for part in ("unet", "image_normalizer", "image_noising_scheduler", "backgrounds"):
         if (source / part).is_dir():
             half_folder(source / part, target / part)
     config = DDPMScheduler.from_pretrained(source / "scheduler").config
     settings = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
     trained = {name: config[name] for name in settings}
-    UniPCMultistepScheduler(**trained, use_exponential_sigmas=True).save_pretrained(target / "scheduler")
+    kind, spacing = SCHEDULERS[target.name]
+    kind(**trained, **spacing).save_pretrained(target / "scheduler")
     write_json(defaults, target / "defaults.json")
 
 
