@@ -202,17 +202,19 @@ def answers_table(figures: Figures) -> str:
 # Model cards ----------------------------------------------------------------------------------------------------------
 
 CARDS = {
-    "touch-to-image": ("touch to picture",),
-    "stylization": (),
-    "x-to-touch": ("touch", "photo to touch", "caption to touch", "sound to touch", "word to touch"),
-    "touch-to-text": ("answer",),
+    "touch-to-image": [
+        f"touch to picture: {end}" for end in ("material", "grain within 20", "contact within material")
+    ],
+    "stylization": [
+        f"restyled photo: {end}" for end in ("material of the touch", "relief of the touch", "layout kept")
+    ],
+    "x-to-touch": [
+        *(f"photo to touch: {end}" for end in ("material", "grain within 20", "contact within material")),
+        *(f"{source} to touch: material" for source in ("caption", "word", "sound")),
+    ],
+    "touch-to-text": [f"answer: {end}" for end in ("material", "grain", "hard or soft", "contact place", "grasp")],
 }
-"""What the figures of a built-in pipeline's card measure."""
-
-ON_CARDS = (
-    "material", "contact within material", "grain", "grain within 20", "hard or soft", "contact place", "grasp",
-)  # fmt: skip
-"""Ends of the names of these figures."""
+"""Figures on the cards of the built-in pipelines."""
 
 DRAWN = {
     "touch-to-image": "Unseen touches, and below each the picture generated from it, of invented colours.",
@@ -225,13 +227,12 @@ DRAWN = {
 def card_settings(figures: Figures) -> dict[str, dict[str, Any]]:
     """Arguments of `Card` by built-in pipeline; pictures are names of files in the family's `cards`."""
     cards = {}
-    for pipeline, measured in CARDS.items():
+    for pipeline, names in CARDS.items():
         told = {}
-        for name, row in figures["quality"]["rows"].items():
-            what, _, end = name.partition(": ")
-            if what in measured and end in ON_CARDS:
-                controls = [f"{words} {row[key]:.1%}" for key, words in CONTROLS.items() if row[key] is not None]
-                told[name] = f"{row['value']:.1%} ({', '.join(controls)})"
+        for name in names:
+            row = figures["quality"]["rows"][name]
+            controls = (f"{words} {_shown(name, row[key])}" for key, words in CONTROLS.items() if row[key] is not None)
+            told[name] = f"{_shown(name, row['value'])} ({', '.join(controls)})"
         cards[pipeline] = {
             "figures": told,
             "data": "The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders "
