@@ -12,7 +12,7 @@ from PIL import Image
 from drawing import MARGIN, draw_grid, font, written
 from tests.helpers.processes import Child, finished, script
 from unitouch_gen import weights
-from unitouch_gen.pipelines.tiny import PIPELINES
+from unitouch_gen.cli.loading import DRAWING
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
@@ -84,7 +84,7 @@ def test_samples_run(file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PIPELINES)
+@pytest.mark.parametrize("name", DRAWING)
 def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
     """Within less than another seed makes (1.8 and more): after new weights, they have to be drawn anew."""
     words = ["--pipeline", name, "--output", "drawn.jpg"]
