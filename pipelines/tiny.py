@@ -59,8 +59,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         needed("peft")
         if not (folder / "turbo").is_dir():
             raise InvalidInputError(
-                f"`family` is {str(family)!r}, which has no weights of {name!r}; copy those that `unitouch-gen "
-                f"distill` wrote to {folder.name}/turbo in there, or take {teacher!r}."
+                f"`family` is {str(family)!r}, which has no folder {folder.name}/turbo for {name!r}; make its "
+                f"weights by `unitouch-gen distill`, or take {teacher!r}."
             )
 
     def stored(part: Any, place: Path) -> Any:
