@@ -200,10 +200,10 @@ def test_data_sets_without_untouched_gels_are_refused_where_the_network_takes_ge
     quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "teacher")
     for kind in ("touch", "picture"):
         (tmp_path / "mine" / kind).mkdir(parents=True)
-        write_image(tmp_path / "mine" / kind / "0.png", (200, 100, 50))
-    words = words_of(
-        tmp_path / "teacher", tmp_path / "run", cache, "--set", f"data.sets=[{{path: {tmp_path / 'mine'}}}]"
-    )
+        for number in range(4):
+            write_image(tmp_path / "mine" / kind / f"{number}.png", (200, 100, 50 * number))
+    sets = f"data.sets=[{{path: {tmp_path / 'mine'}, sensor: digit}}]"
+    words = words_of(tmp_path / "teacher", tmp_path / "run", cache, "--set", sets)
     with pytest.raises(SystemExit, match="2"):
         run("distill", DistillRecipe, main, words)
     assert "`data.sets` have no untouched gels" in capsys.readouterr().err
