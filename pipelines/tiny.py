@@ -31,7 +31,7 @@ FOLDERS = {"stylization": "touch-to-image"}
 """Of what only some pipelines have, where it is not the pipeline's name."""
 
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
-"""Pipelines in four evaluations, without guidance: another's, with the LoRA weights in its folder `turbo`."""
+"""Pipelines of four evaluations, without guidance, and whose networks they take; their LoRA weights lie in `turbo`."""
 
 
 def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
@@ -39,7 +39,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
     Args:
         name: "touch-to-image", "x-to-touch", "stylization" or "touch-to-text"; "touch-to-image-turbo" and
-            "x-to-touch-turbo" draw in four evaluations, and need peft.
+            "x-to-touch-turbo" draw in four evaluations. They need peft, and a family with the weights that
+            `unitouch-gen distill` makes.
         dtype: dtype of the networks; the solver's state is always float32.
         family: Another folder of the same layout, such as one of your own training.
 
@@ -54,6 +55,13 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     teacher = TURBO.get(check_choice("name", name, [*PIPELINES, *TURBO]), name)
     kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
     folder = family / FOLDERS.get(teacher, teacher)
+    if name in TURBO:
+        needed("peft")
+        if not (folder / "turbo").is_dir():
+            raise InvalidInputError(
+                f"`family` is {str(family)!r}, which has no folder {folder.name}/turbo for {name!r}; make its "
+                f"weights by `unitouch-gen distill`, or take {teacher!r}."
+            )
 
     def stored(part: Any, place: Path) -> Any:
         made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
@@ -89,7 +97,6 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         if name in TURBO:
             parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
             parts |= {"default_num_inference_steps": 4, "default_guidance_scale": 1.0}
-            needed("peft")
             # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
             parts["unet"].load_lora_adapter(folder / "turbo", prefix="unet", use_safetensors=True)
             parts["unet"].fuse_lora()  # into the network's own weights: nothing more to compute, and saved with them

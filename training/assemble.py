@@ -46,7 +46,7 @@ def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-# Of diffusers' multistep schedulers and spacings, these do best in so many steps of the built-in networks.
+# Of diffusers' multistep schedulers and spacings, these do best in the number of steps above.
 SCHEDULERS: dict[str, tuple[Any, dict[str, bool]]] = {
     "touch-to-image": (DEISMultistepScheduler, {"use_karras_sigmas": True}),
     "x-to-touch": (UniPCMultistepScheduler, {"use_exponential_sigmas": True}),
@@ -54,7 +54,7 @@ SCHEDULERS: dict[str, tuple[Any, dict[str, bool]]] = {
 
 
 def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> None:
-    """What only one pipeline has: its networks, what it does by itself, and a scheduler over the trained schedule."""
+    """Writes what only one pipeline has: its networks, its defaults, and a scheduler over the trained schedule."""
     for part in ("unet", "image_normalizer", "image_noising_scheduler", "backgrounds"):
         if (source / part).is_dir():
             half_folder(source / part, target / part)

@@ -2,9 +2,9 @@
 
     python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
 
-A student, the network with LoRA layers, learns to say at any noise level what the guided network would arrive at: what
-it says at one level is held to what it says one step of DDIM further. It leaves a LoRA file, to be loaded with the
-`LCMScheduler` of diffusers and called with a `guidance_scale` of 1, since guidance is part of what it has learnt.
+The student is the network with LoRA layers. It learns to predict, at any noise level, the latents that guided sampling
+ends at: its prediction at one level is trained to match the one after a step of guided DDIM. The result is a LoRA file.
+Pipelines use it with diffusers' `LCMScheduler` and a `guidance_scale` of 1, since guidance is learnt, too.
 """
 
 import warnings
@@ -25,13 +25,14 @@ from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.losses import predict
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.training.trainer import Decay
 
 STUDENT, TARGET = "student", "target"
-"""Names of the two sets of LoRA layers: those that are trained, and their moving average."""
+"""Names of the two sets of LoRA layers: the trained ones and their moving average."""
 
 SIGMA_DATA, TIMESTEP_SCALING = 0.5, 10.0
 """Of the boundary condition, as in diffusers' `LCMScheduler`."""
@@ -42,10 +43,10 @@ Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 class DistillSettings(Settings):
     """How the student is taught."""
 
-    guidance_spread: Share  # the scale is uniform around the pipeline's default, by up to this share of it
+    guidance_spread: Share  # guidance is uniform around the pipeline's default, within this share of it
     solver_steps: Annotated[int, Field(ge=2, le=1000)]  # levels from noise to data; LCM's `original_inference_steps`
-    skip: PositiveInt  # of these levels, how many a step of DDIM goes over
-    target_decay: Decay  # of the moving average of the LoRA layers that the student is held to
+    skip: PositiveInt  # levels that one step of DDIM goes over
+    target_decay: Decay  # of the moving average of the LoRA layers
     huber: PositiveFloat  # c of the pseudo-Huber loss
 
 
@@ -57,8 +58,8 @@ class DistillRecipe(Recipe):
 class DistillObjective(nn.Module):
     """Consistency of states a step apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
 
-    One network is all three: without LoRA layers the teacher, with those of `STUDENT` what is trained, with those of
-    `TARGET` what it is held to. `conditioned` is the objective that the network was trained by, for its conditions.
+    One network is all three: without LoRA layers the teacher, with those of `STUDENT` the student, with those of
+    `TARGET` the target. `conditioned` is the objective that trained the network; it makes the conditions.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class DistillObjective(nn.Module):
         steps = torch.arange(1, settings.solver_steps + 1) * (levels // settings.solver_steps) - 1
         self.timesteps = torch.cat([torch.zeros(1, dtype=torch.long), steps])  # from data to noise
         self.sigmas = NoiseSchedule.of(scheduler).sigma(self.timesteps).float()
-        self.follow(1.0)  # to begin with, they are alike
+        self.follow(1.0)  # both begin alike
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         self.follow(1.0 - self.settings.target_decay)
@@ -129,7 +130,7 @@ def ddim_step(denoised: Tensor, z: Tensor, sigma: Tensor, sigma_next: Tensor) ->
 
 
 def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
-    """Gives a network the LoRA layers of the student, which alone are trained, and of the target."""
+    """Adds the LoRA layers of student and target to a network; only the student's are trained."""
     config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
     unet.requires_grad_(False)
     with warnings.catch_warnings():
@@ -145,13 +146,15 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
 def conditioned_touches(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any
 ) -> tuple[Conditioned, ArrayDataset]:
-    """What a network of touches was trained on: its objective, and the data."""
-    with reading("model", stage.folders["model"]):
-        joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
+    """The objective that trains a network of touches, and its data."""
     sensors, with_gels = settings["sensors"], unet.config.in_channels != unet.config.out_channels
     for source in stage.sources:
-        if source.sensor is not None or not with_gels:
+        if with_gels and not isinstance(source, DrawnContacts):
+            raise InvalidInputError("`data.sets` have no untouched gels, which `model` learns from; leave them out.")
+        if sensors and (source.sensor is not None or not with_gels):
             check_choice("data: sensor", source.sensor, sensors)
+    with reading("model", stage.folders["model"]):
+        joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
     dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
     how = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
     return touch_ldm.TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, how, gels), dataset
@@ -160,7 +163,7 @@ def conditioned_touches(
 def conditioned_pictures(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any
 ) -> tuple[Conditioned, ArrayDataset]:
-    """The same of a network of pictures."""
+    """The objective that trains a network of pictures, and its data."""
     folder = stage.folders["model"]
     with reading("model", folder):
         joint, vae, processor = stage.joint_space("image"), read_autoencoder(folder / "vae"), stage.processor

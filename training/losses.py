@@ -41,7 +41,7 @@ def gathered(rows: Tensor) -> Tensor:
 def predict(
     unet: UNet2DConditionModel, noisy: Tensor, steps: Tensor, extra_channels: Tensor | None = None, **conditions: Tensor
 ) -> Tensor:
-    """What the network predicts at noisy latents (B, C, h, w), of the same shape, shown extra channels beside them."""
+    """The network's prediction (B, C, h, w) for noisy latents of this shape, which extra channels are appended to."""
     inputs = noisy if extra_channels is None else torch.cat([noisy, extra_channels], dim=1)
     return unet(inputs, steps, **conditions).sample.float()
 

@@ -52,7 +52,7 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 """Stages that may start from weights in place of random ones, by `--init`."""
 
 NEEDS = {**STAGES, "distill": {"model": "pipeline"}}
-"""The same, and of what no family is made of: distillation takes a saved pipeline."""
+"""The same, with distillation, which is no part of a family and takes a saved pipeline."""
 
 
 class Recipe(Settings):

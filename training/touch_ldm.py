@@ -78,7 +78,7 @@ class TouchDiffusionObjective(nn.Module):
         return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
-        """What the network is told of each sample; where `kept` (B,) is false, what guidance calls unconditional."""
+        """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
         embeds, settings = batch["image_embeds"].float(), self.settings
         (count, width), device = embeds.shape, embeds.device
         size = settings.condition_noise * torch.rand(count, 1, device=device)
@@ -106,9 +106,9 @@ def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
 def inputs(
     stage: Stage, joint: UniTouchModel, vae: Autoencoder, sensors: Sequence[str], with_gels: bool
 ) -> tuple[ArrayDataset, Tensor | None]:
-    """Columns of touches' latents, their pictures' embeddings, sensors and, with gels, the places of their backgrounds.
+    """Columns of latents of touches, embeddings of their pictures, sensors and, with gels, places of their backgrounds.
 
-    `sensors` are the names of the class labels. With gels, the latents (M, C, h, w) of all backgrounds are returned.
+    `sensors` are the names of the class labels. With gels, it also returns the latents (M, C, h, w) of all backgrounds.
     """
     splits = stage.splits("image", "touch", "sensor")
     embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]

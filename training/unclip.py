@@ -51,7 +51,7 @@ class UnclipObjective(nn.Module):
     """Denoising of latents, conditioned on an image embedding, noised by `normalizer` and `noising`, and a prompt.
 
     Prompts are some of the samples' captions. Of the frozen text encoder only the hidden states are used. `level` is
-    that of the noise on embeddings, drawn if left out.
+    the noise level of embeddings; each sample draws one if it is left out.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class UnclipObjective(nn.Module):
         return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
-        """What the network is told of each sample; where `kept` (B,) is false, what guidance calls unconditional."""
+        """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
         embeds, settings = batch["image_embeds"], self.settings
         count, device = len(embeds), embeds.device
         if self.level is None:  # some are at level 0, where a picture's own embedding is used, the others at any level

@@ -15,6 +15,9 @@ from torch.testing import assert_close
 
 from tests.helpers.calls import quiet
 from tests.helpers.components import make_components, make_pipelines
+from tests.helpers.data_sets import write_image
+from tests.helpers.small_family import write_small_family
+from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import run_commands
 from unitouch_gen.training.distill import DistillObjective, DistillRecipe, DistillSettings, add_layers, ddim_step, main
@@ -188,3 +191,19 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
             run("distill", DistillRecipe, main, words_of(tmp_path / folder, tmp_path / "run", cache, *words.split()))
         (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
         assert message in line and not (tmp_path / "run").exists()
+
+
+def test_data_sets_without_untouched_gels_are_refused_where_the_network_takes_gels(
+    cache: Path, tmp_path: Path, capsys: Any
+) -> None:
+    write_small_family(tmp_path / "family")
+    quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "teacher")
+    for kind in ("touch", "picture"):
+        (tmp_path / "mine" / kind).mkdir(parents=True)
+        for number in range(4):
+            write_image(tmp_path / "mine" / kind / f"{number}.png", (200, 100, 50 * number))
+    sets = f"data.sets=[{{path: {tmp_path / 'mine'}, sensor: digit}}]"
+    words = words_of(tmp_path / "teacher", tmp_path / "run", cache, "--set", sets)
+    with pytest.raises(SystemExit, match="2"):
+        run("distill", DistillRecipe, main, words)
+    assert "`data.sets` have no untouched gels" in capsys.readouterr().err

@@ -34,7 +34,7 @@ def app(
         os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
         needed("gradio", "app")
         if not model:
-            take_one_thread()  # what pictures feel like is named outside of pipelines' calls
+            take_one_thread()  # the page names materials outside of pipelines' calls
         from unitouch_gen.cli.page import launch
 
         shared: Any = {"dtype": dtype, "device": device}

@@ -13,12 +13,12 @@ def distill(
     output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
     recipe: Annotated[str, Option(help="A YAML file, or the name of a recipe of the package.")] = "distill",
     overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
-    cache: Annotated[Path, Option(help="What is rendered or decoded to learn from.")] = Path("runs/cache"),
+    cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
 ) -> None:
     """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (LCM-LoRA).
 
-    Example: unitouch-gen distill --model my-pipeline -o turbo --set 'data.sets=[{path: touches}]'
+    Example: unitouch-gen distill --model my-pipeline -o runs/turbo
     """
     folder = folder_of(model)
     import torch
@@ -32,4 +32,4 @@ def distill(
     )  # fmt: skip
     torch.manual_seed(stage.trainer.seed)
     main(stage)
-    echo(f"The weights are in {(output / 'model').resolve()}; use them by pipe.load_lora_weights(...), LCMScheduler")
+    echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")

@@ -130,10 +130,10 @@ def load_joint_space(model: str | None, device: str) -> "tuple[UniTouchModel, Un
 
 
 def take_one_thread() -> None:
-    """One thread for built-in networks outside of pipelines' calls, which see to it themselves.
+    """Sets one thread for built-in networks that run outside of a pipeline's call, which does so itself.
 
-    They are so small that more threads gain a tenth where the machine is idle; where it is busy, these wait for each
-    other in every layer and take forty times as long.
+    They are so small that more threads save a tenth of the time on an idle machine. On a busy one, threads wait for
+    each other in every layer and take forty times as long.
     """
     import torch
 
