@@ -235,13 +235,18 @@ def save_modalities(
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
 
 
+def run_stage(name: str, kind: type[Recipe], main: Callable[[Stage], None], **options: Any) -> None:
+    """Runs a stage by its options, from its seed."""
+    stage = Stage(name, kind, **options)
+    torch.manual_seed(stage.trainer.seed)
+    main(stage)
+
+
 def run(name: str, kind: type[Recipe], main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
     """Runs a stage by its command line, or by words in place of those that the process was started with."""
 
     def command(**options: Any) -> None:
-        stage = Stage(name, kind, **options)
-        torch.manual_seed(stage.trainer.seed)
-        main(stage)
+        run_stage(name, kind, main, **options)
 
     command.__signature__ = signature(partial(Stage, name, kind))  # type: ignore[attr-defined]
     run_command(name, command, words)

@@ -21,15 +21,10 @@ def distill(
     Example: unitouch-gen distill --model my-pipeline -o runs/turbo
     """
     folder = folder_of(model)
-    import torch
 
     from unitouch_gen.training.distill import DistillRecipe, main
-    from unitouch_gen.training.stages import Stage
+    from unitouch_gen.training.stages import run_stage
 
-    stage = Stage(
-        "distill", DistillRecipe, model=folder, output=output, recipe=recipe, overrides=overrides, cache=cache,
-        resume=resume,
-    )  # fmt: skip
-    torch.manual_seed(stage.trainer.seed)
-    main(stage)
+    options = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume}
+    run_stage("distill", DistillRecipe, main, model=folder, output=output, **options)
     echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")
