@@ -97,13 +97,20 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         if name in TURBO:
             parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
             parts |= {"default_num_inference_steps": 4, "default_guidance_scale": 1.0}
-            # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
-            parts["unet"].load_lora_adapter(folder / "turbo", prefix="unet", use_safetensors=True)
-            parts["unet"].fuse_lora()  # into the network's own weights: nothing more to compute, and saved with them
-            parts["unet"].unload_lora()
+            with_lora(parts["unet"], folder / "turbo")
         pipe = kind(**parts)
         pipe._card = _card(family, name)
     return pipe
+
+
+def with_lora(unet: UNet2DConditionModel, folder: Path) -> UNet2DConditionModel:
+    """Adds LoRA weights to a network's own: nothing more to compute, and they are saved with it."""
+    needed("peft")
+    # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
+    unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)
+    unet.fuse_lora()
+    unet.unload_lora()
+    return unet
 
 
 def joint_space(

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from transformers import CLIPTextModel
 
 from unitouch_gen.errors import InvalidInputError, check_choice, needed
-from unitouch_gen.files import read_settings, reading
+from unitouch_gen.files import class_name, read_settings, reading
 from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
@@ -187,9 +187,7 @@ CONDITIONED = {
 def main(stage: Stage) -> None:
     recipe, folder = stage.recipe, stage.folders["model"]
     settings = read_settings("model", folder / "model_index.json")
-    kind = settings.get("_class_name")
-    kind = kind[-1] if isinstance(kind, list) else kind  # [module, class] on the Hub
-    conditioned_by = CONDITIONED[check_choice("model: _class_name", kind, CONDITIONED)]
+    conditioned_by = CONDITIONED[check_choice("model: _class_name", class_name(settings), CONDITIONED)]
     with reading("model", folder):
         unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")

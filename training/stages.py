@@ -51,7 +51,7 @@ STAGES: dict[str, dict[str, str]] = {
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
-NEEDS = {**STAGES, "distill": {"model": "pipeline"}}
+NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}
 """The same, with distillation, which is no part of a family and takes a saved pipeline."""
 
 
@@ -203,7 +203,8 @@ class Stage:
 
 def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in NEEDS[name].items()]
+    places = {option: runs / before / "model" if before in STAGES else before for option, before in NEEDS[name].items()}
+    needs = [f"--{option} {place}" for option, place in places.items()]
     return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 

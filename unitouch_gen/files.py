@@ -233,6 +233,12 @@ def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.load
     return found
 
 
+def class_name(settings: dict[str, Any]) -> Any:
+    """The pipeline's class that a model_index.json names: a text, or [module, class] on the Hub."""
+    name = settings.get("_class_name")
+    return name[-1] if isinstance(name, list) and name else name
+
+
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""

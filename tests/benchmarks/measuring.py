@@ -104,5 +104,6 @@ def machine() -> str:
     known = Path("/proc/cpuinfo")
     lines = known.read_text(encoding="utf-8").splitlines() if known.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    threads = f"{torch.get_num_threads()} threads, torch {torch.__version__}"
-    return f"{(names or [platform.machine()])[0]}, {threads}"
+    count = torch.get_num_threads()
+    threads = "1 thread" if count == 1 else f"{count} threads"
+    return f"{(names or [platform.machine()])[0]}, {threads}, torch {torch.__version__}"

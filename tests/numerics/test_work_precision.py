@@ -24,6 +24,7 @@ from unitouch_gen.numerics.work_precision import (
     world_inputs,
 )
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.sampling import Guidance
 
 GAUSSIAN = problem_target(PROBLEMS["gaussian"], 3)
 MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
@@ -92,6 +93,14 @@ def test_a_baseline_is_diffusers_own_scheduler():
         z = scheduler.step(GAUSSIAN.network(z, timestep), timestep, z, return_dict=False)[0]
     row = measure(GAUSSIAN, "diffusers:ddim", 7, repeats=1)
     assert row["error"] == pytest.approx(relative_rms(z, GAUSSIAN.truth).median().item(), rel=1e-5)
+
+
+def test_a_distilled_network_runs_in_few_steps_without_guidance():
+    """In one step it is its prediction of the data from noise, as DDIM's."""
+    guided = replace(GAUSSIAN, turbo=GAUSSIAN.network, guidance=Guidance(7.5))
+    row = measure(guided, "turbo", 1, repeats=1)
+    assert row["error"] == pytest.approx(measure(GAUSSIAN, "ddim", 1, repeats=1)["error"], rel=1e-4)
+    assert measure(guided, "turbo", 4, repeats=1)["evaluations"] == 4
 
 
 # What the rows say ----------------------------------------------------------------------------------------------------

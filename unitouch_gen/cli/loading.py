@@ -152,10 +152,9 @@ def folder_of(model: str) -> Path:
 
 def kind_of(model: str, kinds: Sequence[str] = DRAWING) -> str:
     """The name of a saved pipeline, which has to be one of some kinds among `CLASSES`."""
-    from unitouch_gen.files import read_settings
+    from unitouch_gen.files import class_name, read_settings
 
-    name = read_settings("--model", folder_of(model) / "model_index.json").get("_class_name")
-    name = name[-1] if isinstance(name, list) and name else name  # [module, class] on the Hub
+    name = class_name(read_settings("--model", folder_of(model) / "model_index.json"))
     known = {CLASSES[kind]: kind for kind in kinds}
     if name not in known:
         raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(known)}.")

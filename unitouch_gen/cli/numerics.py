@@ -1,5 +1,6 @@
 """`unitouch-gen work-precision` and `stability`: error, run time and extreme cases of solvers on any checkpoint."""
 
+import copy
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,9 @@ def work_precision(
     problem: Annotated[str | None, Option(help="An exact problem, such as mixture-7.5.")] = None,
     pipeline: Annotated[str | None, Option(help=f"{', '.join(DRAWING)}.")] = None,
     model: Model = None,
+    lora: Annotated[
+        Path | None, Option(exists=True, help="LoRA weights by `distill`, charted as turbo; else the family's own.")
+    ] = None,
     solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
     tolerances: Annotated[str, Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
@@ -30,18 +34,24 @@ def work_precision(
 
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
+    from unitouch_gen.pipelines.tiny import with_lora
+    from unitouch_gen.weights import FAMILY
 
     if (problem is None) == (pipeline is None):
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
-    if problem is not None and (model is not None or guidance_scale is not None):
-        raise InvalidInputError("`--model` and `--guidance` are of pipelines, not of an exact problem; leave them out.")
+    if problem is not None and (model, lora, guidance_scale) != (None, None, None):
+        raise InvalidInputError("`--model`, `--lora` and `--guidance` are of pipelines, not of an exact problem.")
     check_output([output / "results.json"], overwrite=True)
-    known = [name for name in wp.NAMES if pipeline is not None or name != "default"]
+    built_in = FAMILY / str(pipeline) / "turbo"
+    lora = lora or (built_in if model is None and built_in.is_dir() else None)
+    left_out = {"turbo": lora is None, "default": pipeline is None}
+    known = [name for name in wp.NAMES if not left_out.get(name)]
     names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
     counts, errors = numbers_of("--steps", steps, int, 1, 1000), numbers_of("--tolerances", tolerances, float, 1e-5, 1)
     points: list[dict[str, Any]] = []
     for name in names:
         kind, values = ("tolerance", errors) if name == "adaptive" else ("steps", counts)
+        values = wp.TURBO_STEPS if name == "turbo" else values
         points += [{"solver": check_choice("--solvers", name, known), kind: value} for value in values]
 
     if problem is not None:
@@ -51,7 +61,10 @@ def work_precision(
         if model is None:
             take_one_thread()
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
-        target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale)
+        student = None if lora is None else with_lora(copy.deepcopy(pipe.unet), lora)
+        target = wp.pipeline_target(
+            pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, student=student
+        )
         if "default" in names:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up

@@ -10,12 +10,13 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
+from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, LCMScheduler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
@@ -38,8 +39,10 @@ BASELINES: dict[str, tuple[type, dict[str, Any]]] = {
 }
 """diffusers' own schedulers as its users exchange them, which ours are measured against."""
 
-NAMES = (*SOLVERS, "adaptive", "default", *BASELINES)
-"""Solvers that can be measured; "default" is a pipeline's own scheduler."""
+TURBO_STEPS = (1, 2, 4, 8)
+
+NAMES = (*SOLVERS, "adaptive", "default", "turbo", *BASELINES)
+"""Solvers that can be measured: "default" is a pipeline's own scheduler, "turbo" a distilled network."""
 
 
 # What is measured -----------------------------------------------------------------------------------------------------
@@ -57,6 +60,7 @@ class Target:
     truth: Tensor  # (N, C, h, w) float64
     own_error: float = 0.0  # of the truth, median; 0 for a closed form
     default_steps: int | None = None  # of a pipeline
+    turbo: Network | None = None  # which needs no guidance
 
 
 def problem_target(problem: Problem, seeds: int = 8) -> Target:
@@ -69,7 +73,7 @@ def problem_target(problem: Problem, seeds: int = 8) -> Target:
 @torch.no_grad()
 def pipeline_target(
     pipe: Any, inputs: Mapping[str, Tensor], *, name: str = "", seeds: int = 2, guidance_scale: float | None = None,
-    rtol: float = 1e-4, **options: Any,
+    rtol: float = 1e-4, student: Any = None, **options: Any,
 ) -> Target:  # fmt: skip
     """The network of a pipeline under conditions, from some noises each.
 
@@ -78,6 +82,7 @@ def pipeline_target(
         seeds: Noises for each condition.
         rtol: Tolerance of the reference. A trained network ripples with the waves of the timestep's embedding, by about
             one percent over some ten levels; far below this tolerance solvers follow every ripple.
+        student: A UNet that was distilled from the pipeline's, for "turbo".
     """
     guidance = Guidance(pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale)
     seen: list[tuple[Tensor, dict[str, Any]]] = []
@@ -93,7 +98,7 @@ def pipeline_target(
     (states, conditions), unet, scheduler = seen[0], pipe.unet, pipe.scheduler
     channels, schedule = unet.config.out_channels, NoiseSchedule.of(scheduler)
 
-    def network(z: Tensor, timestep: Tensor) -> Tensor:
+    def network(z: Tensor, timestep: Tensor, unet: Any = unet) -> Tensor:
         """Of a batch without unconditional half, the conditions of the other one."""
         of_rows = {key: value[-len(z) :] if isinstance(value, Tensor) else value for key, value in conditions.items()}
         beside = states[-len(z) :, channels:]  # what the network is shown as further channels
@@ -110,7 +115,8 @@ def pipeline_target(
     noise = torch.randn(samples, channels, *states.shape[2:], generator=torch.Generator().manual_seed(0))
     truth, disagreement = solve_reference(denoise, noise, schedule, rtol)
     own_error, steps = disagreement.median().item(), pipe.config["default_num_inference_steps"]
-    return Target(name, network, scheduler, guidance, noise.to(states.device), truth, own_error, steps)
+    turbo = None if student is None else partial(network, unet=student)
+    return Target(name, network, scheduler, guidance, noise.to(states.device), truth, own_error, steps, turbo)
 
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor]:
@@ -134,7 +140,11 @@ def measure(
     row: Row = {"solver": solver, "steps": steps, "tolerance": tolerance, "samples": len(target.noise), "reason": ""}
     row["default"] = solver == "default" and steps == target.default_steps
     scheduler: Any = target.scheduler
-    if solver in BASELINES:
+    network, guidance = target.network, target.guidance
+    if solver == "turbo":
+        scheduler, guidance = LCMScheduler.from_config(scheduler.config), Guidance(1.0)
+        network = target.turbo or network
+    elif solver in BASELINES:
         kind, settings = BASELINES[solver]
         known = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
         scheduler = kind(**{name: scheduler.config[name] for name in known}, **settings)
@@ -143,7 +153,8 @@ def measure(
         prepared = prepare_steps(scheduler, solver=named, num_inference_steps=steps, tolerance=tolerance)
         for _ in range(repeats):
             report, started = RunReport(), time.perf_counter()
-            latents = sample(target.network, target.noise, prepared, report, guidance=target.guidance, throw=False)
+            noise = torch.Generator().manual_seed(0)  # that some schedulers add
+            latents = sample(network, target.noise, prepared, report, guidance=guidance, generator=noise, throw=False)
             seconds.append((time.perf_counter() - started) / len(latents))
     except Exception as error:  # the other points are worth having, and this one says what it was
         return {**row, "failures": len(target.noise), "reason": f"{type(error).__name__}: {first_line(error)}"}
