@@ -2,16 +2,17 @@
 
     python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
 
-The student is the network with LoRA layers. It learns to predict, at any noise level, the latents that guided sampling
-ends at: its prediction at one level is trained to match the one after a step of guided DDIM. The result is a LoRA file.
-Pipelines use it with diffusers' `LCMScheduler` and a `guidance_scale` of 1, since guidance is learnt, too.
+The student is the network with LoRA layers. It learns to predict, at the noise levels of diffusers' `LCMScheduler` in
+a few steps, the latents that guided sampling ends at: its prediction at one level is trained to match the one at the
+next level, where guided DDIM leads. The result is a LoRA file. Pipelines use it with that scheduler and a
+`guidance_scale` of 1, since guidance is learnt, too.
 """
 
 import warnings
 from typing import Annotated, Any
 
 import torch
-from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -44,8 +45,8 @@ class DistillSettings(Settings):
     """How the student is taught."""
 
     guidance_spread: Share  # guidance is uniform around the pipeline's default, within this share of it
-    solver_steps: Annotated[int, Field(ge=2, le=1000)]  # levels from noise to data; LCM's `original_inference_steps`
-    skip: PositiveInt  # levels that one step of DDIM goes over
+    levels: Annotated[int, Field(ge=1, le=50)]  # steps of `LCMScheduler` whose noise levels are learnt
+    solver_steps: PositiveInt  # of DDIM from one level to the next
     target_decay: Decay  # of the moving average of the LoRA layers
     huber: PositiveFloat  # c of the pseudo-Huber loss
 
@@ -56,7 +57,7 @@ class DistillRecipe(Recipe):
 
 
 class DistillObjective(nn.Module):
-    """Consistency of states a step apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
+    """Consistency of states a level apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
 
     One network is all three: without LoRA layers the teacher, with those of `STUDENT` the student, with those of
     `TARGET` the target. `conditioned` is the objective that trained the network; it makes the conditions.
@@ -70,20 +71,18 @@ class DistillObjective(nn.Module):
         self.trained, self.settings, self.guidance_scale = unet, settings, guidance_scale
         self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
         self.prediction_type = scheduler.config.prediction_type
-        levels = scheduler.config.num_train_timesteps
-        steps = torch.arange(1, settings.solver_steps + 1) * (levels // settings.solver_steps) - 1
-        self.timesteps = torch.cat([torch.zeros(1, dtype=torch.long), steps])  # from data to noise
-        self.sigmas = NoiseSchedule.of(scheduler).sigma(self.timesteps).float()
+        self.schedule, lcm = NoiseSchedule.of(scheduler), LCMScheduler.from_config(scheduler.config)
+        lcm.set_timesteps(settings.levels)
+        self.timesteps = torch.cat([torch.zeros(1), lcm.timesteps.flip(0)])  # from data to noise
         self.follow(1.0)  # both begin alike
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         self.follow(1.0 - self.settings.target_decay)
         latents, settings = batch["latents"].float(), self.settings
         count, device = len(latents), latents.device
-        step = torch.randint(1, len(self.timesteps), (count,))
-        (t, sigma), (t_next, sigma_next) = (
-            self._level(at, device) for at in (step, (step - settings.skip).clamp(min=0))
-        )
+        level = torch.randint(1, len(self.timesteps), (count,))
+        first, last = self.timesteps[level], self.timesteps[level - 1]
+        t, sigma = self._noise(first, device)
         every = torch.ones(count, dtype=torch.bool, device=device)
         conditions = self.frozen[0].conditions(batch, every)
         unconditional = self.frozen[0].conditions(batch, ~every)
@@ -92,12 +91,19 @@ class DistillObjective(nn.Module):
         with torch.no_grad():
             self.trained.disable_adapters()
             both = {name: torch.cat([unconditional[name], given]) for name, given in conditions.items()}
-            without, given = predict(self.trained, torch.cat([z, z]), torch.cat([t, t]), **both).chunk(2)
-            guided = without + self.guidance_scale * (1.0 + spread) * (given - without)
-            z_next = ddim_step(to_denoised(guided, z, sigma, self.prediction_type), z, sigma, sigma_next)
+            ahead, t_ahead, sigma_ahead = z, t, sigma
+            for step in range(settings.solver_steps):
+                without, given = predict(
+                    self.trained, torch.cat([ahead, ahead]), torch.cat([t_ahead, t_ahead]), **both
+                ).chunk(2)
+                guided = without + self.guidance_scale * (1.0 + spread) * (given - without)
+                denoised = to_denoised(guided, ahead, sigma_ahead, self.prediction_type)
+                before, share = sigma_ahead, (step + 1) / settings.solver_steps
+                t_ahead, sigma_ahead = self._noise((first + share * (last - first)).round(), device)
+                ahead = ddim_step(denoised, ahead, before, sigma_ahead)
             self.trained.enable_adapters()
             self.trained.set_adapter(TARGET)
-            aim = self._consistency(z_next, t_next, sigma_next, conditions)
+            aim = self._consistency(ahead, t_ahead, sigma_ahead, conditions)
         self.trained.set_adapter(STUDENT)
         error = self._consistency(z, t, sigma, conditions) - aim
         loss = ((error.square() + settings.huber**2).sqrt() - settings.huber).mean()
@@ -111,9 +117,10 @@ class DistillObjective(nn.Module):
                 student = self.trained.get_parameter(name.replace(f".{TARGET}.", f".{STUDENT}."))
                 parameter.lerp_(student, share)
 
-    def _level(self, at: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Timesteps (B,) and noise levels (B, 1, 1, 1)."""
-        return self.timesteps[at].to(device), self.sigmas[at].to(device)[:, None, None, None]
+    def _noise(self, timesteps: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Timesteps (B,) and their noise levels (B, 1, 1, 1)."""
+        sigmas = self.schedule.sigma(timesteps).float()
+        return timesteps.to(device), sigmas.to(device)[:, None, None, None]
 
     def _consistency(self, z: Tensor, t: Tensor, sigma: Tensor, conditions: dict[str, Tensor]) -> Tensor:
         """f(z, t) = c_skip z + c_out x_0(z, t) (B, C, h, w), which is z at t = 0."""

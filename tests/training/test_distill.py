@@ -25,7 +25,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(guidance_spread=0.0, solver_steps=50, skip=1, target_decay=0.5, huber=1e-3)
+SETTINGS = DistillSettings(guidance_spread=0.0, levels=50, solver_steps=1, target_decay=0.5, huber=1e-3)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 
@@ -38,7 +38,7 @@ class Known(nn.Module):
         self.alphas = scheduler.alphas_cumprod
 
     def forward(self, z: Tensor, t: Tensor, **conditions: Tensor) -> Any:
-        abar = self.alphas[t][:, None, None, None]
+        abar = self.alphas[t.long()][:, None, None, None]
         return UNet2DConditionOutput(sample=z * (abar / (1 - abar)).sqrt())
 
     def set_adapter(self, name: str) -> None:
@@ -54,17 +54,19 @@ class Nothing:
         return {}
 
 
-def make(unet: Any, kind: str = "v_prediction") -> DistillObjective:
+def make(unet: Any, kind: str = "v_prediction", **settings: int) -> DistillObjective:
     scheduler = DDPMScheduler(**SCHEDULE, prediction_type=kind)
-    return DistillObjective(unet, scheduler, Nothing(), SETTINGS, guidance_scale=3.0)  # type: ignore[arg-type]
+    asked: Any = (Nothing(), SETTINGS.model_copy(update=settings))
+    return DistillObjective(unet, scheduler, *asked, guidance_scale=3.0)
 
 
-def test_a_network_that_arrives_where_its_solver_does_has_nothing_to_learn() -> None:
-    objective = make(Known(DDPMScheduler(**SCHEDULE)))
+@pytest.mark.parametrize(("levels", "solver_steps"), [(50, 1), (8, 3)])
+def test_a_network_that_arrives_where_its_solver_does_has_nothing_to_learn(levels: int, solver_steps: int) -> None:
+    objective = make(Known(DDPMScheduler(**SCHEDULE)), levels=levels, solver_steps=solver_steps)
     torch.manual_seed(0)
     batch = {"latents": torch.zeros(1024, 4, 4, 4)}
     assert objective(batch)["loss"] > 1e-4  # beside the data, noise of the lowest level is left as it is
-    objective.timesteps, objective.sigmas = objective.timesteps[1:], objective.sigmas[1:]
+    objective.timesteps = objective.timesteps[1:]
     assert objective(batch)["loss"] < 1e-7
 
 
@@ -80,17 +82,18 @@ def test_steps_and_what_is_held_to_are_those_of_diffusers(kind: str) -> None:
     assert objective.timesteps[1:].flip(0).tolist() == ddim.timesteps.tolist() == lcm.timesteps.tolist()
     with torch.no_grad():
         for place in (1, 20, 50):
-            (t, sigma), (_, sigma_next) = (objective._level(torch.tensor([at, at]), "cpu") for at in (place, place - 1))
+            levels = (objective.timesteps[[at, at]] for at in (place, place - 1))
+            (t, sigma), (_, sigma_next) = (objective._noise(level, torch.device("cpu")) for level in levels)
             prediction = unet(z, t, **conditions).sample
-            step = ddim.step(prediction, t[0], z)
+            step = ddim.step(prediction, t[0].long(), z)
             assert_close(
                 ddim_step(step.pred_original_sample, z, sigma, sigma_next), step.prev_sample, atol=1e-4, rtol=0
             )
             lcm._step_index = None
-            found = lcm.step(prediction, t[0], z).denoised
+            found = lcm.step(prediction, t[0].long(), z).denoised
             assert_close(objective._consistency(z, t, sigma, conditions), found, atol=1e-4, rtol=1e-4)
             assert not torch.allclose(found, z, atol=0.1)
-        t, sigma = objective._level(torch.zeros(2, dtype=torch.long), "cpu")
+        t, sigma = objective._noise(torch.zeros(2), torch.device("cpu"))
         assert torch.equal(objective._consistency(z, t, sigma, conditions), z)  # at t = 0
 
 
