@@ -28,7 +28,10 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-text": TouchToTextPipeline,
 }
 FOLDERS = {"stylization": "touch-to-image"}
-"""Of what only some pipelines have, where it is not the pipeline's name."""
+"""Of networks that only some pipelines have, where it is not the pipeline's name."""
+
+BRIDGED = (TactileStylizationPipeline, XToTouchPipeline)
+"""Those that have the embedding bank. To others a touch's own embedding says more of its grain and place."""
 
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
 """Pipelines of four evaluations, without guidance, and whose networks they take; their LoRA weights lie in `turbo`."""
@@ -71,8 +74,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     with reading("family", family):
         joint, processor = joint_space(family, dtype)
         parts: dict[str, Any] = {"unitouch": joint, "processor": processor}
-        parts |= read_settings("family", folder / "defaults.json")
-        if (family / "embedding-bank").is_dir():
+        parts |= read_settings("family", family / teacher / "defaults.json")
+        if kind in BRIDGED and (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
         if kind is TouchToTextPipeline:
             language = folder / "language_model"

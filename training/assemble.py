@@ -21,7 +21,8 @@ from unitouch_gen.training.stages import STAGES, command_of, run_command, weight
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
 TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 12,
-                  "default_noise_level": 250}  # fmt: skip
+                  "default_noise_level": 150}  # fmt: skip
+STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
 
 
@@ -101,6 +102,8 @@ def assemble(
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(models[stage], place / stage.replace("_", "-"))
         write_generator(models["unclip"], place / "touch-to-image", TOUCH_TO_IMAGE)
+        (place / "stylization").mkdir()
+        write_json(STYLIZATION, place / "stylization" / "defaults.json")
         ldm = models["touch_ldm"]
         sensors = json.loads((ldm / "sensors.json").read_text())
         write_generator(ldm, place / "x-to-touch", {"sensors": sensors, **X_TO_TOUCH})

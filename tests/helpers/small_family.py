@@ -39,6 +39,8 @@ def write_small_family(folder: Path) -> None:
         shutil.copy(part / "defaults.json", folder / part.name)
     shutil.copytree(weights.TOUCH_TO_IMAGE / "image_noising_scheduler", unclip / "image_noising_scheduler")
     StableUnCLIPImageNormalizer(embedding_dim=width).half().save_pretrained(unclip / "image_normalizer")
+    (folder / "stylization").mkdir()
+    shutil.copy(weights.FAMILY / "stylization" / "defaults.json", folder / "stylization")
     language, parts = folder / weights.TOUCH_TO_TEXT.name, make_language_parts()
     parts["language_bridge"].half().save_pretrained(language / "language_bridge")
     parts["language_model"].half().save_pretrained(language / "language_model")
