@@ -120,8 +120,8 @@ class Touches:
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
     """A network conditioned on embeddings of the joint space.
 
-    Subclasses have the components `unitouch`, `processor` and `embedding_bank`; those that make images also have
-    `unet`, `scheduler` and `vae`.
+    Subclasses have the components `unitouch` and `processor`; those that make images also have `unet`, `scheduler`,
+    `vae` and `embedding_bank`.
     """
 
     _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
@@ -140,9 +140,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     def _check_widths(self, network: str) -> None:
         """Raises if the joint space or the bank has embeddings of another width than the network takes."""
+        bank = getattr(self, "embedding_bank", None)
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
-            "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
+            "embedding_bank": bank and bank.config.embedding_dim,
         }
         for name, width in widths.items():
             if width not in (None, self.embedding_dim):

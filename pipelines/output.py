@@ -48,7 +48,7 @@ class TouchToTextPipelineOutput(BaseOutput):
         texts: Answers, those of one input together.
         report: What the call did.
         embeds: Embeddings (B, D) that the answers are about; pass them to another call to skip encoding.
-        encoded: Touch embeddings (B, D) before mix and bridge. `None` without touches.
+        encoded: Touch embeddings (B, D) before they are mixed. `None` without touches.
     """
 
     texts: list[str]

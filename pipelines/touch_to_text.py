@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
-from unitouch_gen.conditioning import EmbeddingBank, mix_to_norm
+from unitouch_gen.conditioning import mix_to_norm
 from unitouch_gen.convert_llm import read_touch_llm
 from unitouch_gen.errors import (
     InvalidInputError,
@@ -45,25 +45,24 @@ class TouchToTextPipeline(UniTouchPipeline):
         language_model: Any causal language model of transformers whose attention ends in `o_proj`.
         tokenizer: The language model's; its chat template is used if it has one.
         unitouch, processor: The joint space and its processor. May be `None` if embeddings are passed.
-        embedding_bank: Image embeddings that touches are moved to; `None` for no such bridge.
         prompt_template: What the language model was trained to be asked by, with "{question}" in it.
     """
 
     model_cpu_offload_seq = "unitouch->language_model"
-    _optional_components = ["unitouch", "processor", "embedding_bank"]
-    _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "language_bridge"]
+    _optional_components = ["unitouch", "processor"]
+    _exclude_from_cpu_offload = ["unitouch", "language_bridge"]
     _main_network, _task = "language_model", "image-to-text"
     _example_call, _example_end = 'pipe(example("brick"), "How does it feel?")', "print(output.texts[0])"
 
     def __init__(
         self, language_bridge: LanguageBridge, language_model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase,
         unitouch: UniTouchModel | None = None, processor: UniTouchProcessor | None = None,
-        embedding_bank: EmbeddingBank | None = None, prompt_template: str = QUESTION,
+        prompt_template: str = QUESTION,
     ):  # fmt: skip
         super().__init__()
         self.register_modules(
             language_bridge=language_bridge, language_model=language_model, tokenizer=tokenizer, unitouch=unitouch,
-            processor=processor, embedding_bank=embedding_bank,
+            processor=processor,
         )  # fmt: skip
         if QUESTION not in check_kind("prompt_template", prompt_template, str):
             raise InvalidInputError(f"`prompt_template` is {prompt_template!r}; it has to hold '{QUESTION}'.")
@@ -80,7 +79,7 @@ class TouchToTextPipeline(UniTouchPipeline):
     def __call__(
         self,
         touch: ImageInput = None, question: str | list[str] | None = None, max_new_tokens: int | None = None,
-        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
+        sensor: SensorNames = None, background: ImageInput = None,
         weights: Sequence[float] | None = None, image: ImageInput = None, touch_embeds: Tensor | None = None,
         generator: torch.Generator | None = None, return_dict: bool = True, **generate: Any,
     ) -> TouchToTextPipelineOutput | tuple:  # fmt: skip
@@ -107,9 +106,9 @@ class TouchToTextPipeline(UniTouchPipeline):
         if others or not name:
             raise InvalidInputError("`touch`, `image` or `touch_embeds` has to be passed, one of them.")
         if name == "touch":
-            bridge, inputs = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
+            inputs = self._prepare_touch(touch, sensor, background)
         else:
-            check_unused(name, sensor=sensor, background=background, bridge=bridge or None)
+            check_unused(name, sensor=sensor, background=background)
             inputs = touch_embeds if name == "touch_embeds" else self._joint(name) and self.processor.images(image)
         if name == "touch_embeds":
             check_tensor(name, inputs, "B", self.embedding_dim)
@@ -127,7 +126,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         # 2. Encode the touch
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
         with report.stage(name):
-            encoded, embeds = self._encode(name, inputs, weights, bool(bridge), report)
+            encoded, embeds = self._encode(name, inputs, weights, report)
 
         # 3. Generate token ids, after prompts that are padded on the left
         device, pad, width = self._execution_device, config.pad_token_id, max(report.prompt_tokens)
@@ -147,24 +146,21 @@ class TouchToTextPipeline(UniTouchPipeline):
         return TouchToTextPipelineOutput(texts, report, embeds, encoded) if return_dict else (texts, report)
 
     @runs_networks
-    def encode_touch(
-        self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None
-    ) -> Tensor:
+    def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        bridge, touches = self._check_bridge(bridge), self._prepare_touch(touch, sensor, background)
-        return self._encode("touch", touches, None, bridge, AnswerReport())[1]
+        return self._encode("touch", self._prepare_touch(touch, sensor, background), None, AnswerReport())[1]
 
     def _encode(
-        self, name: str, inputs: Any, weights: Sequence[float] | None, bridge: bool, report: AnswerReport
+        self, name: str, inputs: Any, weights: Sequence[float] | None, report: AnswerReport
     ) -> tuple[Tensor | None, Tensor]:
-        """Embeddings (B, D): of touches as encoded, and of any inputs with mix and bridge."""
+        """Embeddings (B, D): of touches as encoded, and of any inputs, mixed by the weights."""
         encoded = self._touch_embeds(inputs, report) if name == "touch" else None
         if name == "image":
             inputs = self._match_norm(self.unitouch.get_image_features(inputs), name)
         embeds = inputs if encoded is None else encoded
         if weights is not None:
             embeds = mix_to_norm(embeds[:, None], torch.tensor(weights))
-        return encoded, self.embedding_bank.bridge(embeds) if bridge else embeds
+        return encoded, embeds
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""

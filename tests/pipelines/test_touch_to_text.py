@@ -11,7 +11,6 @@ from transformers import TextIteratorStreamer
 from tests.helpers.calls import seeded
 from tests.helpers.components import D
 from tests.helpers.language import make_language_parts
-from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.pipelines import TouchToTextPipeline
@@ -23,8 +22,7 @@ QUESTION, SHORT = "How does it feel?", {"max_new_tokens": 6, "min_new_tokens": 6
 @pytest.fixture
 def ask(components):
     joint = {name: components[name] for name in ("unitouch", "processor")}
-    bank = EmbeddingBank.of(torch.randn(20, D, generator=seeded(4)))
-    return TouchToTextPipeline(**make_language_parts(), **joint, embedding_bank=bank)
+    return TouchToTextPipeline(**make_language_parts(), **joint)
 
 
 def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, touch):
@@ -32,8 +30,7 @@ def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, to
     questions = [QUESTION, "Where is it?"]
     output = ask(touch, questions, **SHORT)
     embeds = ask.encode_touch(touch)
-    assert torch.equal(output.embeds, embeds)
-    assert_close(embeds, ask.embedding_bank.bridge(output.encoded))
+    assert torch.equal(output.embeds, embeds) and torch.equal(embeds, output.encoded)
     for row, question in enumerate(questions):
         ids = torch.tensor([ask.tokenizer(question)["input_ids"]])
         with ask.language_bridge.attach(ask.language_model, embeds[row : row + 1]):
@@ -50,7 +47,7 @@ def test_one_input_has_several_questions_or_answers_and_several_touches_are_one_
     assert len(several.texts) == 4 and several.embeds.shape == (1, D)
     assert several.texts[:2] == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2,
                                     **SHORT).texts  # fmt: skip
-    mixed = ask(touch, QUESTION, weights=[1, 3], bridge=False, **SHORT)
+    mixed = ask(touch, QUESTION, weights=[1, 3], **SHORT)
     wanted = (torch.tensor([0.25, 0.75]) @ mixed.encoded)[None]
     assert_close(torch.nn.functional.normalize(mixed.embeds), torch.nn.functional.normalize(wanted))
     assert len(mixed.texts) == 1
@@ -116,9 +113,9 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("num_beams", InvalidInputError, {**two, "num_beams": 0}),
         ("streamer", InvalidInputError, {**two, "streamer": TextIteratorStreamer(ask.tokenizer)}),
         ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
-        ("generator", InvalidTypeError, {**two, "generator": 3}), ("bridge", InvalidTypeError, {**two, "bridge": "x"}),
+        ("generator", InvalidTypeError, {**two, "generator": 3}),
         ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),
-        ("bridge", InvalidInputError, {"image": photo, "question": QUESTION, "bridge": True}),
+        ("sensor", InvalidInputError, {"image": photo, "question": QUESTION, "sensor": "digit"}),
     ):  # fmt: skip
         with pytest.raises(error, match=f"`{name}`") as caught:
             ask(**options)

@@ -39,7 +39,7 @@ BASELINES: dict[str, tuple[type, dict[str, Any]]] = {
 }
 """diffusers' own schedulers as its users exchange them, which ours are measured against."""
 
-TURBO_STEPS = (1, 2, 4, 8)
+TURBO_STEPS = [1, 2, 4, 8]
 
 NAMES = (*SOLVERS, "adaptive", "default", "turbo", *BASELINES)
 """Solvers that can be measured: "default" is a pipeline's own scheduler, "turbo" a distilled network."""
