@@ -28,13 +28,13 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-text": TouchToTextPipeline,
 }
 FOLDERS = {"stylization": "touch-to-image"}
-"""Of networks that only some pipelines have, where it is not the pipeline's name."""
+"""Folder of a pipeline's networks, where it is not named after the pipeline."""
 
-BRIDGED = (TactileStylizationPipeline, XToTouchPipeline)
-"""Those that have the embedding bank. To others a touch's own embedding says more of its grain and place."""
+WITH_BANK = (TactileStylizationPipeline, XToTouchPipeline)
+"""Pipelines that get the embedding bank. Without it, pictures and answers keep more of a touch's grain and place."""
 
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
-"""Pipelines of four evaluations, without guidance, and whose networks they take; their LoRA weights lie in `turbo`."""
+"""Distilled pipelines, and those that they were distilled from, whose folders hold the LoRA weights in `turbo`."""
 
 
 def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
@@ -42,8 +42,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
     Args:
         name: "touch-to-image", "x-to-touch", "stylization" or "touch-to-text"; "touch-to-image-turbo" and
-            "x-to-touch-turbo" draw in four evaluations. They need peft, and a family with the weights that
-            `unitouch-gen distill` makes.
+            "x-to-touch-turbo" draw in four evaluations and need peft.
         dtype: dtype of the networks; the solver's state is always float32.
         family: Another folder of the same layout, such as one of your own training.
 
@@ -75,7 +74,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         joint, processor = joint_space(family, dtype)
         parts: dict[str, Any] = {"unitouch": joint, "processor": processor}
         parts |= read_settings("family", family / teacher / "defaults.json")
-        if kind in BRIDGED and (family / "embedding-bank").is_dir():
+        if kind in WITH_BANK and (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
         if kind is TouchToTextPipeline:
             language = folder / "language_model"
@@ -107,10 +106,12 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
 
 def with_lora(unet: UNet2DConditionModel, folder: Path) -> UNet2DConditionModel:
-    """Adds LoRA weights to a network's own: nothing more to compute, and they are saved with it."""
+    """Fuses LoRA weights into a network, in place, and returns it."""
     needed("peft")
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
     unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)
+    if not getattr(unet, "peft_config", None):
+        raise InvalidInputError(f"{str(folder)!r} holds no LoRA weights of a UNet.")
     unet.fuse_lora()
     unet.unload_lora()
     return unet

@@ -204,7 +204,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         else:
             with report.stage("touch"):
                 encoded, embeds = self._encode(touches, strength, bridge, report, throw)
-            if not bridge:
+            if not bridge and self.embedding_bank is not None:
                 report.left_out.append("embedding bank")
 
         # 3. Generate from its embedding

@@ -45,7 +45,7 @@ class DistillSettings(Settings):
     """How the student is taught."""
 
     guidance_spread: Share  # guidance is uniform around the pipeline's default, within this share of it
-    levels: Annotated[int, Field(ge=1, le=50)]  # steps of `LCMScheduler` whose noise levels are learnt
+    levels: Annotated[int, Field(ge=1, le=50)]  # steps of `LCMScheduler`, whose noise levels are learnt
     solver_steps: PositiveInt  # of DDIM from one level to the next
     target_decay: Decay  # of the moving average of the LoRA layers
     huber: PositiveFloat  # c of the pseudo-Huber loss
@@ -82,28 +82,19 @@ class DistillObjective(nn.Module):
         count, device = len(latents), latents.device
         level = torch.randint(1, len(self.timesteps), (count,))
         first, last = self.timesteps[level], self.timesteps[level - 1]
-        t, sigma = self._noise(first, device)
+        t, sigma = self._levels(first, device)
         every = torch.ones(count, dtype=torch.bool, device=device)
         conditions = self.frozen[0].conditions(batch, every)
         unconditional = self.frozen[0].conditions(batch, ~every)
+        both = {name: torch.cat([unconditional[name], given]) for name, given in conditions.items()}
         spread = settings.guidance_spread * (2.0 * torch.rand(count, 1, 1, 1, device=device) - 1.0)
         z = alpha(sigma) * (latents + sigma * torch.randn_like(latents))
         with torch.no_grad():
             self.trained.disable_adapters()
-            both = {name: torch.cat([unconditional[name], given]) for name, given in conditions.items()}
-            ahead, t_ahead, sigma_ahead = z, t, sigma
-            for step in range(settings.solver_steps):
-                without, given = predict(
-                    self.trained, torch.cat([ahead, ahead]), torch.cat([t_ahead, t_ahead]), **both
-                ).chunk(2)
-                guided = without + self.guidance_scale * (1.0 + spread) * (given - without)
-                denoised = to_denoised(guided, ahead, sigma_ahead, self.prediction_type)
-                before, share = sigma_ahead, (step + 1) / settings.solver_steps
-                t_ahead, sigma_ahead = self._noise((first + share * (last - first)).round(), device)
-                ahead = ddim_step(denoised, ahead, before, sigma_ahead)
+            z_next = self._guided_ddim(z, first, last, both, self.guidance_scale * (1.0 + spread))
             self.trained.enable_adapters()
             self.trained.set_adapter(TARGET)
-            aim = self._consistency(ahead, t_ahead, sigma_ahead, conditions)
+            aim = self._consistency(z_next, *self._levels(last, device), conditions)
         self.trained.set_adapter(STUDENT)
         error = self._consistency(z, t, sigma, conditions) - aim
         loss = ((error.square() + settings.huber**2).sqrt() - settings.huber).mean()
@@ -117,10 +108,24 @@ class DistillObjective(nn.Module):
                 student = self.trained.get_parameter(name.replace(f".{TARGET}.", f".{STUDENT}."))
                 parameter.lerp_(student, share)
 
-    def _noise(self, timesteps: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
+    def _levels(self, timesteps: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
         """Timesteps (B,) and their noise levels (B, 1, 1, 1)."""
         sigmas = self.schedule.sigma(timesteps).float()
         return timesteps.to(device), sigmas.to(device)[:, None, None, None]
+
+    def _guided_ddim(
+        self, z: Tensor, first: Tensor, last: Tensor, both: dict[str, Tensor], guidance_scale: Tensor
+    ) -> Tensor:
+        """States (B, C, h, w) at timesteps `last` (B,), from those at `first`; unconditional `both` come first."""
+        t, sigma = self._levels(first, z.device)
+        for step in range(1, self.settings.solver_steps + 1):
+            without, given = predict(self.trained, torch.cat([z, z]), torch.cat([t, t]), **both).chunk(2)
+            guided = without + guidance_scale * (given - without)
+            ahead = first + (step / self.settings.solver_steps) * (last - first)
+            t, sigma_next = self._levels(ahead.round(), z.device)
+            z = ddim_step(to_denoised(guided, z, sigma, self.prediction_type), z, sigma, sigma_next)
+            sigma = sigma_next
+        return z
 
     def _consistency(self, z: Tensor, t: Tensor, sigma: Tensor, conditions: dict[str, Tensor]) -> Tensor:
         """f(z, t) = c_skip z + c_out x_0(z, t) (B, C, h, w), which is z at t = 0."""

@@ -8,13 +8,14 @@ same conditions, relative to the exact flow; seconds are of one sample, of calls
 import statistics
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from diffusers import DDIMScheduler, StableUnCLIPImg2ImgPipeline
 
-from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of
+from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
 from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import NotConvergedError
@@ -27,6 +28,7 @@ from unitouch_gen.numerics.work_precision import (
     pipeline_target,
     world_inputs,
 )
+from unitouch_gen.pipelines.tiny import TURBO
 from unitouch_gen.solvers import SOLVERS
 
 CONDITIONS = 8
@@ -42,7 +44,7 @@ def error_and_time_figures() -> Figures:
     speedup = {name: speedup_figures(pipe, held_out(name, pipe, CONDITIONS), *USUAL[name])
                for name, pipe in pipes.items()}  # fmt: skip
     cost = {name: cost_figures(pipe, held_out(name, pipe, 2 * CONDITIONS)) for name, pipe in pipes.items()}
-    return {"speedup": speedup, "cost": cost, "physics": physics_figures()}
+    return {"speedup": speedup, "cost": cost, "turbo": turbo_figures(), "physics": physics_figures()}
 
 
 def held_out(name: str, pipe: Any, conditions: int) -> dict[str, Any]:
@@ -154,6 +156,38 @@ def cheapest_within(target: Target, error: float, steps: Sequence[int] = STEPS) 
         if within:
             return min(within, key=lambda row: row["error"])
     raise NotConvergedError(f"No solver comes within {error:.2g} of the exact latents in up to {steps[-1]} steps.")
+
+
+# Four evaluations -----------------------------------------------------------------------------------------------------
+
+
+def turbo_figures(batches: Sequence[int] = (1, 32), repeats: int = 3) -> Figures:
+    """Seconds a sample of whole calls, encoding and decoding included, and speed-ups, by pipeline and batch size: over
+    diffusers' DDIM in 50 steps at guidance 9, and over the default call."""
+    figures: Figures = {}
+    for name, of in TURBO.items():
+        usual, turbo = quiet(of), quiet(name)
+        for size in batches:
+            inputs = world_inputs(("touch",) if of == "touch-to-image" else ("image",), size)
+            calls = {
+                "ddim": partial(ddim_seconds, usual, inputs),
+                "default": partial(seconds_of, usual, **inputs, output_type="pt"),
+                "turbo": partial(seconds_of, turbo, **inputs, output_type="pt"),
+            }
+            seen = in_turns(calls, repeats)
+            seconds = {who: statistics.median(taken) / size for who, taken in seen.items()}
+            ratios = {f"over {who}": ratio_of(seen[who], seen["turbo"]) for who in ("ddim", "default")}
+            figures[f"{of}, {size} at once"] = {"seconds": seconds, **ratios}
+    return figures
+
+
+def ddim_seconds(pipe: Any, inputs: dict[str, Any]) -> float:
+    """Seconds of DDIM in 50 steps at guidance 9; of pictures, with those of encoding the touches."""
+    started = time.perf_counter()
+    given = {"touch_embeds": pipe.encode_touch(**inputs)} if "touch" in inputs else inputs
+    encoding = time.perf_counter() - started
+    settings = {"num_inference_steps": 50, "guidance_scale": 9.0, "output_type": "pt"}
+    return encoding + usual_call(pipe, given, **settings)[1]["whole"]
 
 
 # What an error costs --------------------------------------------------------------------------------------------------

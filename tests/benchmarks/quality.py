@@ -48,7 +48,7 @@ from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
-from unitouch_gen.pipelines.tiny import PIPELINES
+from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
 from unitouch_gen.training.data.heldout import FIRST_SEED
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.attributes import gaussian_blur
@@ -294,6 +294,12 @@ def of_untrained(figures: Mapping[str, Mapping[str, float]], told: str) -> Figur
     return {**remaining, "untrained": {**means, "least": least, "most": most}}
 
 
+TURBO_ROWS: dict[str, tuple[Callable[..., Figures], str]] = {
+    "touch-to-image": (touch_to_image_rows, "image"), "x-to-touch": (x_to_touch_rows, "touch"),
+}  # fmt: skip
+"""How a distilled pipeline is measured: the function, and what its classifier reads."""
+
+
 # The command ----------------------------------------------------------------------------------------------------------
 
 
@@ -318,6 +324,10 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
             found |= restyled_rows(pipes["stylization"], judges["image"], contacts, *drawn)
         if "x-to-touch" in pipes and given.touched_by:
             found |= x_to_touch_rows(pipes["x-to-touch"], judges["touch"], contacts, *drawn)
+        for name in [name for name in TURBO if name in pipes and given.touched_by]:
+            rows_of, classifier = TURBO_ROWS[TURBO[name]]
+            made = rows_of(pipes[name], judges[classifier], contacts, *drawn)
+            found |= {f"in four evaluations, {key}": row for key, row in made.items()}
         if "touch-to-text" in pipes:
             found |= answer_rows(pipes["touch-to-text"], joint, contacts, given.each)
         if given.photos and seed == seeds[0]:
@@ -355,13 +365,17 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--objects", type=int, default=16, help="held-out objects of each material")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--each", type=int, default=8, help="contacts of each material that are generated from")
-    parser.add_argument("--pipelines", nargs="+", default=[*PIPELINES], choices=PIPELINES, help="whose figures; all")
+    parser.add_argument(
+        "--pipelines", nargs="+", choices=[*PIPELINES, *TURBO], help="whose figures; all of the family if left out"
+    )
     parser.add_argument("--photos", type=Path, help="folder of whole photos to restyle")
     parser.add_argument("--cache", type=Path, help="where contacts are rendered to, and found again")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     given = parser.parse_args(words)
     if given.joint is None and given.family is None:
         parser.error("name `--joint` or `--family`.")
+    distilled = [name for name, of in TURBO.items() if given.family and (given.family / of / "turbo").is_dir()]
+    given.pipelines = given.pipelines or [*PIPELINES, *distilled]
     given.joint = given.joint or [given.family / weights.JOINT.name]
     own = {"image": given.picture_classifier, "touch": given.touch_classifier}
     built_in = {"image": weights.PICTURE_CLASSIFIER.name, "touch": weights.TOUCH_CLASSIFIER.name}

@@ -31,6 +31,14 @@ def test_a_call_without_options_has_the_checkpoints_defaults_and_128_pixels(call
     assert not any(part.training for part in call.pipe.components.values() if isinstance(part, torch.nn.Module))
 
 
+def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_level() -> None:
+    pictures, restyled = (unitouch_gen.tiny(name) for name in ("touch-to-image", "stylization"))
+    assert pictures.embedding_bank is None and restyled.embedding_bank is not None
+    assert pictures.config.default_noise_level < restyled.config.default_noise_level
+    weights = zip(pictures.unet.parameters(), restyled.unet.parameters(), strict=True)
+    assert all(torch.equal(*pair) for pair in weights)
+
+
 def test_a_tolerance_is_kept_or_told_of(call):
     """Against many more steps of another solver."""
     found, reference = call(tolerance=0.1, output_type="latent"), call.latents(solver="dpm++2m", num_inference_steps=30)

@@ -83,7 +83,7 @@ def test_steps_and_what_is_held_to_are_those_of_diffusers(kind: str) -> None:
     with torch.no_grad():
         for place in (1, 20, 50):
             levels = (objective.timesteps[[at, at]] for at in (place, place - 1))
-            (t, sigma), (_, sigma_next) = (objective._noise(level, torch.device("cpu")) for level in levels)
+            (t, sigma), (_, sigma_next) = (objective._levels(level, torch.device("cpu")) for level in levels)
             prediction = unet(z, t, **conditions).sample
             step = ddim.step(prediction, t[0].long(), z)
             assert_close(
@@ -93,8 +93,22 @@ def test_steps_and_what_is_held_to_are_those_of_diffusers(kind: str) -> None:
             found = lcm.step(prediction, t[0].long(), z).denoised
             assert_close(objective._consistency(z, t, sigma, conditions), found, atol=1e-4, rtol=1e-4)
             assert not torch.allclose(found, z, atol=0.1)
-        t, sigma = objective._noise(torch.zeros(2), torch.device("cpu"))
+        t, sigma = objective._levels(torch.zeros(2), torch.device("cpu"))
         assert torch.equal(objective._consistency(z, t, sigma, conditions), z)  # at t = 0
+
+
+def test_the_teacher_goes_where_guided_ddim_of_diffusers_leads() -> None:
+    unet, ddim = make_components()["unet"], DDIMScheduler(**SCHEDULE, prediction_type="epsilon", set_alpha_to_one=False)
+    ddim.set_timesteps(50)
+    z, scale = torch.randn(2, 4, 8, 8), torch.tensor([2.0, 5.0])[:, None, None, None]
+    both = {"encoder_hidden_states": torch.randn(4, 3, 16), "class_labels": torch.randn(4, 32)}
+    first, last = torch.full((2,), 499.0), torch.full((2,), 459.0)
+    with torch.no_grad():
+        found, expected = make(unet, "epsilon", solver_steps=2)._guided_ddim(z, first, last, both, scale), z
+        for timestep in (499, 479):
+            without, given = unet(torch.cat([expected] * 2), timestep, **both).sample.chunk(2)
+            expected = ddim.step(without + scale * (given - without), timestep, expected).prev_sample
+    assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_layers_alone_are_trained_and_the_target_follows_the_student() -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,7 @@ def work_precision(
     pipeline: Annotated[str | None, Option(help=f"{', '.join(DRAWING)}.")] = None,
     model: Model = None,
     lora: Annotated[
-        Path | None, Option(exists=True, help="LoRA weights by `distill`, charted as turbo; else the family's own.")
+        Path | None, Option(exists=True, help="Folder of LoRA weights by distill, charted as turbo; or built-in.")
     ] = None,
     solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
@@ -32,9 +33,10 @@ def work_precision(
     """
     from tqdm import tqdm
 
+    from unitouch_gen.files import reading
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
-    from unitouch_gen.pipelines.tiny import with_lora
+    from unitouch_gen.pipelines.tiny import TURBO, with_lora
     from unitouch_gen.weights import FAMILY
 
     if (problem is None) == (pipeline is None):
@@ -42,8 +44,8 @@ def work_precision(
     if problem is not None and (model, lora, guidance_scale) != (None, None, None):
         raise InvalidInputError("`--model`, `--lora` and `--guidance` are of pipelines, not of an exact problem.")
     check_output([output / "results.json"], overwrite=True)
-    built_in = FAMILY / str(pipeline) / "turbo"
-    lora = lora or (built_in if model is None and built_in.is_dir() else None)
+    if model is None and f"{pipeline}-turbo" in TURBO and find_spec("peft"):
+        lora = lora or FAMILY / str(pipeline) / "turbo"
     left_out = {"turbo": lora is None, "default": pipeline is None}
     known = [name for name in wp.NAMES if not left_out.get(name)]
     names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
@@ -61,7 +63,10 @@ def work_precision(
         if model is None:
             take_one_thread()
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
-        student = None if lora is None else with_lora(copy.deepcopy(pipe.unet), lora)
+        student = None
+        if lora is not None and "turbo" in names:
+            with reading("--lora", lora):
+                student = with_lora(copy.deepcopy(pipe.unet), lora)
         target = wp.pipeline_target(
             pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, student=student
         )

@@ -1,12 +1,12 @@
 """The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
 
-Layout: `joint/` is the space of all four modalities with its processor, `embedding-bank/` embeddings of pictures that
-those of other modalities are moved towards by two pipelines; `image-vae/` the autoencoder of pictures,
-`touch-vae/` that of touch images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only pipelines of this
-kind have, and their `turbo/` the LoRA weights of `-turbo` ones; `stylization/` has the defaults of stylisation over the
-first of these. `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the
-pictures of model cards, and `family.json` holds figures, what the cards say, seeds, times and recipes. Every tensor is
-stored once, in fp16.
+Layout: `joint/` is the space of all four modalities with its processor; `embedding-bank/` holds image embeddings that
+stylisation and x-to-touch move others towards; `image-vae/` is the autoencoder of pictures, `touch-vae/` that of touch
+images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only these pipelines have, and their `turbo/` the
+LoRA weights of `-turbo` ones; `stylization/` holds only defaults, as its networks are those of `touch-to-image/`.
+`picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
+model cards, and `family.json` holds figures, what the cards say, seeds, times and recipes. Every tensor is stored once,
+in fp16.
 """
 
 from pathlib import Path
