@@ -129,6 +129,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _example_call, _example_end = "", 'output.images[0].save("output.png")'  # shown on the model card
     _task = "image-to-image"  # and its tag
     text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
+    embedding_bank: Any = None  # touch-to-text has none
     _card: Card | Path | None = None  # or the folder with the card
 
     def _finish_init(self, network: str, **defaults: float) -> None:
@@ -140,10 +141,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     def _check_widths(self, network: str) -> None:
         """Raises if the joint space or the bank has embeddings of another width than the network takes."""
-        bank = getattr(self, "embedding_bank", None)
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
-            "embedding_bank": bank and bank.config.embedding_dim,
+            "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
         }
         for name, width in widths.items():
             if width not in (None, self.embedding_dim):

@@ -200,12 +200,12 @@ class TouchToImagePipeline(UniTouchPipeline):
         # 2. Encode the touch
         report = RunReport()
         if touches is None:
-            report.left_out += ["touch encoder", "embedding bank"]
+            report.left_out.append("touch encoder")
         else:
             with report.stage("touch"):
                 encoded, embeds = self._encode(touches, strength, bridge, report, throw)
-            if not bridge and self.embedding_bank is not None:
-                report.left_out.append("embedding bank")
+        if self.embedding_bank is not None and (touches is None or not bridge):
+            report.left_out.append("embedding bank")
 
         # 3. Generate from its embedding
         images = self._generate(settings, embeds, noise_level, prompts, report)

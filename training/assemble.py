@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
+from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.language_model import PROMPT
 from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
 
@@ -60,8 +61,7 @@ def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> Non
         if (source / part).is_dir():
             half_folder(source / part, target / part)
     config = DDPMScheduler.from_pretrained(source / "scheduler").config
-    settings = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
-    trained = {name: config[name] for name in settings}
+    trained = {name: config[name] for name in TRAINED}
     kind, spacing = SCHEDULERS[target.name]
     kind(**trained, **spacing).save_pretrained(target / "scheduler")
     write_json(defaults, target / "defaults.json")

@@ -18,6 +18,10 @@ PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
 """As diffusers' schedulers call them."""
 
 
+TRAINED = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
+"""Settings of a diffusers scheduler that its network was trained with; the others are of sampling."""
+
+
 @dataclass(frozen=True, eq=False)
 class NoiseSchedule:
     """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates."""

@@ -182,11 +182,12 @@ def turbo_figures(batches: Sequence[int] = (1, 32), repeats: int = 3) -> Figures
 
 
 def ddim_seconds(pipe: Any, inputs: dict[str, Any]) -> float:
-    """Seconds of DDIM in 50 steps at guidance 9; of pictures, with those of encoding the touches."""
+    """Seconds of DDIM as the paper draws pictures; of pictures, with those of encoding the touches."""
     started = time.perf_counter()
     given = {"touch_embeds": pipe.encode_touch(**inputs)} if "touch" in inputs else inputs
     encoding = time.perf_counter() - started
-    settings = {"num_inference_steps": 50, "guidance_scale": 9.0, "output_type": "pt"}
+    steps, scale = USUAL["touch-to-image"]
+    settings = {"num_inference_steps": steps, "guidance_scale": scale, "output_type": "pt"}
     return encoding + usual_call(pipe, given, **settings)[1]["whole"]
 
 

@@ -198,7 +198,8 @@ def turbo_table(figures: Figures) -> str:
     quality, rows = figures["quality"]["rows"], []
     for name in (f"{made}: {end}" for made in DISTILLED for end in ENDS):
         both = [quality[name], quality[f"in four evaluations, {name}"]]
-        rows.append([name, *(f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})" for row in both)])
+        values = (f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})" for row in both)
+        rows.append([name, *values, *(_shown(name, both[1][key]) for key in CONTROLS)])
     times = [
         f"{name}: {row['over ddim']['ratio']:.1f} and {row['over default']['ratio']:.1f}"
         for name, row in figures["error_and_time"]["turbo"].items()
@@ -207,7 +208,7 @@ def turbo_table(figures: Figures) -> str:
         f"Times as fast, in whole calls, as diffusers' DDIM in 50 steps at guidance 9, and as the default: "
         f"{'; '.join(times)}. Distances are to real images, smaller is better."
     )
-    return table(["figure", "default (spread)", "four evaluations (spread)"], rows, note)
+    return table(["figure", "default (spread)", "four evaluations (spread)", *CONTROLS.values()], rows, note)
 
 
 def answers_table(figures: Figures) -> str:

@@ -36,7 +36,6 @@ def work_precision(
     from unitouch_gen.files import reading
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
-    from unitouch_gen.pipelines.tiny import TURBO, with_lora
     from unitouch_gen.weights import FAMILY
 
     if (problem is None) == (pipeline is None):
@@ -44,8 +43,9 @@ def work_precision(
     if problem is not None and (model, lora, guidance_scale) != (None, None, None):
         raise InvalidInputError("`--model`, `--lora` and `--guidance` are of pipelines, not of an exact problem.")
     check_output([output / "results.json"], overwrite=True)
-    if model is None and f"{pipeline}-turbo" in TURBO and find_spec("peft"):
-        lora = lora or FAMILY / str(pipeline) / "turbo"
+    built_in = FAMILY / str(pipeline) / "turbo"
+    if lora is None and model is None and built_in.is_dir() and find_spec("peft"):
+        lora = built_in
     left_out = {"turbo": lora is None, "default": pipeline is None}
     known = [name for name in wp.NAMES if not left_out.get(name)]
     names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
@@ -65,6 +65,8 @@ def work_precision(
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
         student = None
         if lora is not None and "turbo" in names:
+            from unitouch_gen.pipelines.tiny import with_lora
+
             with reading("--lora", lora):
                 student = with_lora(copy.deepcopy(pipe.unet), lora)
         target = wp.pipeline_target(

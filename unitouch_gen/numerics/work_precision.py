@@ -27,7 +27,7 @@ from unitouch_gen.files import write_file
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.sampling import SOLVERS, Guidance, Network, RunReport, prepare_steps, sample
-from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
+from unitouch_gen.schedule import TRAINED, NoiseSchedule, alpha, to_denoised
 
 Row = dict[str, Any]
 """A result: solver, steps or tolerance, quartiles of the error, evaluations, seconds per sample, failures and why."""
@@ -148,8 +148,7 @@ def measure(
         network = target.turbo
     elif solver in BASELINES:
         kind, settings = BASELINES[solver]
-        known = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
-        scheduler = kind(**{name: scheduler.config[name] for name in known}, **settings)
+        scheduler = kind(**{name: scheduler.config[name] for name in TRAINED}, **settings)
     named, seconds, report = solver if solver in SOLVERS else None, [], RunReport()
     try:
         prepared = prepare_steps(scheduler, solver=named, num_inference_steps=steps, tolerance=tolerance)
