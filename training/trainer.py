@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal, Self
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
-from accelerate.state import AcceleratorState
 from accelerate.utils import set_seed
 from diffusers.training_utils import EMAModel
 from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
@@ -81,7 +80,6 @@ class Trainer:
         self.dataset, self.indices_of = dataset, indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds = 0, 0.0
-        AcceleratorState._reset_state()  # a training before in the same process may have had another precision
         self.accelerator = Accelerator(
             mixed_precision=config.mixed_precision,
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from accelerate.state import AcceleratorState
 from diffusers import AutoencoderTiny
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
@@ -28,6 +29,12 @@ SPACE = {
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
 BLOCKS |= {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
+
+
+@pytest.fixture(autouse=True)
+def precision() -> None:
+    """Each test begins as a process does: accelerate keeps the precision of the first training."""
+    AcceleratorState._reset_state()
 
 
 def autoencoder(**changes: object) -> AutoencoderTiny:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -70,6 +71,7 @@ def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None
     overrides = [word for setting in (*SHORT, *SETTINGS[name]) for word in ("--set", setting)]
     places = ["--output", str(runs / (output or name)), "--cache", str(runs / "cache")]
     main = import_module(f"unitouch_gen.training.{name}").main
+    AcceleratorState._reset_state()  # as a process of its own would find it
     run(name, KINDS[name], main, [*given, *overrides, *places, *words])
 
 
