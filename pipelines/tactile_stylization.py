@@ -82,7 +82,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         self,
         image: ImageInput = None, touch: ImageInput = None, prompt: str | list[str] | None = None,
         touch_weight: float | None = None, image_weight: float | None = None, mix: str = "linear",
-        layout: int | None = 12, keep_colours: bool = False, init_strength: float = 1.0,
+        layout: int | None = 14, keep_colours: bool = False, init_strength: float = 1.0,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         guidance_scale: float | None = None,
         strength: float = 1.0, negative_prompt: str | list[str] | None = None,

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--touches", type=Path, nargs="+", default=sorted(INPUTS.glob("*.png"))[:5])
     parser.add_argument("--touch-weight", type=float, default=0.7, help="share of the touch")
     parser.add_argument(
-        "--layout", type=int, default=12, help="cells along a side of the grid on which the photo is held"
+        "--layout", type=int, default=14, help="cells along a side of the grid on which the photo is held"
     )
     arguments = parser.parse_args()
 

@@ -21,7 +21,7 @@ from unitouch_gen.training.stages import STAGES, command_of, run_command, weight
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
-TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 12,
+TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 10,
                   "default_noise_level": 150}  # fmt: skip
 STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best beside the embedding bank
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}

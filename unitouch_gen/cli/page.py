@@ -98,7 +98,7 @@ def style_fields(pipe: Any) -> Fields:
         "image": upload("image", "Photo"),
         **touch_fields(pipe),
         "touch_weight": gradio.Slider(0, 1, 0.7, step=0.05, label="Share of the touch in the mix"),
-        "layout": gradio.Slider(2, 16, 12, step=1, label="How finely the photo's layout is held"),
+        "layout": gradio.Slider(2, 16, 14, step=1, label="How finely the photo's layout is held"),
         "keep_colours": gradio.Checkbox(False, label="Hold its mean colour, too"),
     }
 
