@@ -244,10 +244,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         model, pixels, background = self.unitouch, touches.pixels, touches.background
         if background is not None:
             pixels = model.recentre(pixels, background, touches.matches)
-        features = model.get_touch_features(pixels, model.sensor_ids(touches.matches))
+        features, reasons = model.encode_touches(pixels, model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
-        reasons = model.unknown_touches(pixels) or [None] * len(pixels)
+        reasons = reasons or [None] * len(pixels)
         if background is not None:
             untouched = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
             reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]

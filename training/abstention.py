@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance
+from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
+from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.world import ATTRIBUTES
 
@@ -36,13 +36,17 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
     return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
 
 
+@torch.no_grad()
 def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
     """Gives a model the distance of touches, by class where materials are known, and its threshold."""
 
     def statistics(images: Iterable[np.ndarray]) -> Tensor:
         pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
         parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
-        return torch.cat([model.get_touch_statistics(part).cpu() for part in parts])
+        found = [
+            touch_statistics(model.touch_model.stem(part.to(model.device)), denormalise_pixels(part)) for part in parts
+        ]
+        return torch.cat(found).cpu()
 
     cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
     pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]

@@ -280,8 +280,7 @@ def abstained(joint: JointSpace, touches: np.ndarray) -> dict[str, float]:
     """Shares of uint8 touches (N, 3, S, S) that are called untouched, and unlike anything known."""
     model, reasons = joint.models["touch"], list[str | None]()
     for part in torch.from_numpy(touches).split(256):
-        pixels = normalise_pixels(part.float() / 255)
-        reasons += model.unknown_touches(pixels)
+        reasons += model.encode_touches(normalise_pixels(part.float() / 255))[1]
     return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
 
 

@@ -26,13 +26,13 @@ def test_pictures_are_unknown_and_touches_are_not(scene, dtype, tmp_path) -> Non
     UniTouchModel.from_pretrained(weights.JOINT, dtype=dtype).save_pretrained(tmp_path)
     model, processor = UniTouchModel.from_pretrained(tmp_path), UniTouchProcessor.from_pretrained(weights.JOINT)
     for pictures, low, high in ((scene.image, 0.7, 1.0), *((touch, 0.0, 0.15) for touch in scene.touch.values())):
-        reasons = model.unknown_touches(processor.touch(pictures))
+        reasons = model.encode_touches(processor.touch(pictures))[1]
         assert set(reasons) <= {None, "unlike anything known"}
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high
 
 
 def test_a_model_without_a_distance_says_nothing(model: UniTouchModel, inputs: dict) -> None:
-    assert model.unknown_touches(**inputs["touch"]) == []
+    assert model.encode_touches(**inputs["touch"])[1] == []
 
 
 def test_a_touch_is_compared_with_its_gel_at_rest() -> None:

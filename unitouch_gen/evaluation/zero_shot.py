@@ -97,8 +97,7 @@ class ZeroShotTouchClassifier:
             raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
         pixels = self.processor.touch(touch).to(self.model.device)
         matches = self.model.match_sensors(pixels, sensor)
-        features = self.model.get_touch_features(pixels, self.model.sensor_ids(matches))
-        unknown = self.model.unknown_touches(pixels)
+        features, unknown = self.model.encode_touches(pixels, self.model.sensor_ids(matches))
         return self.name(features, "touch", names, template, top=top, unknown=unknown)
 
     @torch.no_grad()
@@ -112,7 +111,7 @@ class ZeroShotTouchClassifier:
             features: (B, D), of any length.
             modality: That they came from; its template is used.
             labels, template, top: See `__call__`.
-            unknown: What `UniTouchModel.unknown_touches` says of each; nothing where it is empty.
+            unknown: What `UniTouchModel.encode_touches` says of each; nothing where it is empty.
         """
         shares = (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
         best = shares.topk(min(top or len(labels), len(labels)))

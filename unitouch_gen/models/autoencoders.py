@@ -6,6 +6,7 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import torch
 from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
@@ -51,8 +52,10 @@ def encode(vae: Autoencoder, pixels: Tensor) -> Tensor:
 
 def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
     """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
-    raw = latents / vae.config.scaling_factor + _shift(vae)
-    return vae.decode(raw.to(vae.dtype), return_dict=False)[0].float()
+    raw = (latents / vae.config.scaling_factor + _shift(vae)).to(vae.dtype)
+    # Convolutions on a CPU take two thirds of the time in this layout, and in parts that its caches hold.
+    parts = raw.to(memory_format=torch.channels_last).split(8) if raw.device.type == "cpu" else [raw]
+    return torch.cat([vae.decode(part, return_dict=False)[0].float() for part in parts])
 
 
 def _shift(vae: Autoencoder) -> float:

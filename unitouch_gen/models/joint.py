@@ -3,6 +3,7 @@
 import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -94,10 +95,20 @@ class UniTouchModel(PreTrainedModel):
 
         `sensor_ids` are indices in the bank, integers (B,), -1 for a sensor without tokens; `None` retrieves them.
         """
+        return self.encode_touches(pixel_values, sensor_ids)[0]
+
+    @apply_forward_hook
+    def encode_touches(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> tuple[Tensor, list[str | None]]:
+        """Embeddings as `get_touch_features` has them, and why each touch is out of distribution, or `None`.
+
+        There are no reasons without a fitted distance.
+        """
         touch_model, sensor_bank = self.load("touch")
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
-        return sensor_bank.encode(touch_model, pixel_values.to(touch_model.projection.weight), sensor_ids)
+        patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
+        features = sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids)
+        return features, self._unknown(patches.detach(), pixel_values)
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
@@ -153,18 +164,11 @@ class UniTouchModel(PreTrainedModel):
         return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
 
     @torch.no_grad()
-    @apply_forward_hook
-    def get_touch_statistics(self, pixel_values: Tensor) -> Tensor:
-        """`out_of_distribution.touch_statistics` of touches (B, 3, S, S), (B, width + 12)."""
-        touch_model, _ = self.load("touch")
-        patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
-        return touch_statistics(patches, denormalise_pixels(pixel_values.float()))
-
-    def unknown_touches(self, pixel_values: Tensor) -> list[str | None]:
-        """Reason each touch (B, 3, S, S) is out of distribution, or `None`; empty without a fitted distance."""
+    def _unknown(self, patches: Tensor, pixel_values: Tensor) -> list[str | None]:
         if "touch" not in self.out_of_distribution:
             return []
-        distances = self.out_of_distribution["touch"](self.get_touch_statistics(pixel_values).to(self.device))
+        statistics = touch_statistics(patches, denormalise_pixels(pixel_values.float()))
+        distances = self.out_of_distribution["touch"](statistics.to(self.device))
         threshold = self.config.ood_thresholds["touch"]["foreign"]
         return [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.models.vit import local_mean
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming a touch."""
@@ -68,9 +69,7 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
         patches: Output of the touch encoder's stem, (B, width, h, w).
         pixels: In [0, 1], (B, 3, H, W).
     """
-    blur = max(3, max(pixels.shape[-2:]) // 14 | 1)
-    around = F.pad(pixels, (blur // 2,) * 4, mode="replicate")
-    detail = (pixels - F.avg_pool2d(around, blur, 1)).flatten(2)
+    detail = (pixels - local_mean(pixels, max(1, max(pixels.shape[-2:]) // 28))).flatten(2)
     covariance = (detail @ detail.mT / detail.shape[-1]).nan_to_num() + 1e-9 * torch.eye(3).to(pixels)
     deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
     red, green, _ = (covariance / (deviation[:, :, None] * deviation[:, None])).unbind(dim=1)

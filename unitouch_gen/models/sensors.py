@@ -119,13 +119,13 @@ class SensorBank(nn.Module):
         distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
         return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
 
-    def encode(self, encoder: Callable[..., Tensor], pixels: Tensor, indices: Tensor) -> Tensor:
-        """An encoder's output for pixel values with the tokens of their sensors, (B, ...); index -1 has none."""
+    def encode(self, encoder: Callable[..., Tensor], inputs: Tensor, indices: Tensor) -> Tensor:
+        """An encoder's output for inputs (B, ...) with the tokens of their sensors; index -1 has none."""
         rows_of: dict[bool, list[int]] = {}
         for row, index in enumerate(indices.tolist()):
             rows_of.setdefault(index >= 0, []).append(row)
         parts, order = [], list[int]()
         for has_tokens, rows in rows_of.items():
-            parts.append(encoder(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
+            parts.append(encoder(inputs[rows], self.tokens[indices[rows].long()] if has_tokens else None))
             order += rows
         return torch.cat(parts)[torch.tensor(order).argsort()]

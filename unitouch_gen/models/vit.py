@@ -88,18 +88,22 @@ class LocalContrast(nn.Module):
         self.reach = int(0.06 * side) // 2
 
     def forward(self, pixels: Tensor) -> Tensor:
-        detail = pixels - self._mean(self._mean(pixels))
+        detail = pixels - local_mean(local_mean(pixels, self.reach), self.reach)
         deviation = detail.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
         detail = (detail / (deviation + 0.03)).clamp(-4.0, 4.0)  # a deviation of 0.03 is about the noise
         return torch.cat([pixels, detail], dim=1)
 
-    def _mean(self, pixels: Tensor) -> Tensor:
-        """The mean around each pixel, by cumulative sums: a fifth of the time of an average pool."""
-        side = 2 * self.reach + 1
-        padded = F.pad(pixels, (self.reach + 1, self.reach) * 2, mode="replicate")
-        sums = padded.float().cumsum(dim=-1)
-        sums = (sums[..., side:] - sums[..., :-side]).cumsum(dim=-2)
-        return ((sums[..., side:, :] - sums[..., :-side, :]) / side**2).to(pixels.dtype)
+
+def local_mean(pixels: Tensor, reach: int) -> Tensor:
+    """The mean of the square around each pixel of (B, C, H, W), which reaches so far; the border is repeated.
+
+    By cumulative sums: a fifth of the time of an average pool.
+    """
+    side = 2 * reach + 1
+    padded = F.pad(pixels, (reach + 1, reach) * 2, mode="replicate")
+    sums = padded.float().cumsum(dim=-1)
+    sums = (sums[..., side:] - sums[..., :-side]).cumsum(dim=-2)
+    return ((sums[..., side:, :] - sums[..., :-side, :]) / side**2).to(pixels.dtype)
 
 
 class Residual(nn.Module):
@@ -183,12 +187,12 @@ class UniTouchViT(nn.Module):
             sizes = (width, rows * columns, config.patch_channels, config.projection_dim)
             self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps)
 
-    def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W).
+    def forward(self, pixels: Tensor, prefix: Tensor | None = None, stemmed: bool = False) -> Tensor:
+        """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W); `stemmed`: of the stem's output.
 
         The prefix, (B, L, width), is put between class token and patches; it carries no position.
         """
-        return self.embed(self.tokens(pixels, prefix))
+        return self.embed(self.tokens(pixels, prefix, stemmed))
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Embeddings (B, D) of what leaves the blocks, the prefix with it or without it."""
@@ -197,9 +201,9 @@ class UniTouchViT(nn.Module):
             embeds = embeds + self.patch_projection(tokens[:, 1 - self.position.shape[1] :])
         return embeds
 
-    def tokens(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
+    def tokens(self, pixels: Tensor, prefix: Tensor | None = None, stemmed: bool = False) -> Tensor:
         """Output of the blocks, (B, 1 + L + patches, width): class token, prefix, patches by rows."""
-        x = self.stem(pixels).flatten(2).transpose(1, 2)  # (B, patches, width)
+        x = (pixels if stemmed else self.stem(pixels)).flatten(2).transpose(1, 2)  # (B, patches, width)
         if self.stem_norm is not None:
             x = self.stem_norm(x)
         x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
