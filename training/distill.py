@@ -4,10 +4,11 @@
 
 The student is the network with LoRA layers. It learns to predict, at the noise levels of diffusers' `LCMScheduler` in
 a few steps, the latents that guided sampling ends at: its prediction at one level is trained to match the one at the
-next level, where guided DDIM leads. The result is a LoRA file, cut by SVD to the size that was asked for. Pipelines use
-it with that scheduler and a `guidance_scale` of 1, since guidance is learnt, too.
+next level, where guided DDIM leads. The result is a LoRA file. Pipelines use it with that scheduler and a
+`guidance_scale` of 1, since guidance is learnt, too.
 """
 
+import warnings
 from typing import Annotated, Any
 
 import torch
@@ -26,11 +27,13 @@ from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts
-from unitouch_gen.training.lora import STUDENT, TARGET, add_layers, cut_to_size
 from unitouch_gen.training.losses import predict
-from unitouch_gen.training.recipe import Arguments, Settings, Share, read, read_recipe
+from unitouch_gen.training.recipe import Arguments, Settings, Share, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.training.trainer import Decay
+
+STUDENT, TARGET = "student", "target"
+"""Names of the two sets of LoRA layers: the trained ones and their moving average."""
 
 SIGMA_DATA, TIMESTEP_SCALING = 0.5, 10.0
 """Of the boundary condition, as in diffusers' `LCMScheduler`."""
@@ -48,13 +51,8 @@ class DistillSettings(Settings):
     huber: PositiveFloat  # c of the pseudo-Huber loss
 
 
-class DistilledFile(Settings):
-    megabytes: Annotated[float, Field(ge=0.1)]  # at most; layers of a higher rank are cut to it
-
-
 class DistillRecipe(Recipe):
     lora: Arguments
-    file: DistilledFile
     objective: DistillSettings
 
 
@@ -143,6 +141,20 @@ def ddim_step(denoised: Tensor, z: Tensor, sigma: Tensor, sigma_next: Tensor) ->
     return alpha(sigma_next) * (denoised + sigma_next * noise)
 
 
+def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
+    """Adds the LoRA layers of student and target to a network; only the student's are trained."""
+    config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
+    unet.requires_grad_(False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
+        try:
+            unet.add_adapter(config, TARGET)
+            unet.add_adapter(config, STUDENT)
+        except ValueError as error:  # no such modules
+            raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
+    unet.set_adapter(STUDENT)
+
+
 def conditioned_touches(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any
 ) -> tuple[Conditioned, ArrayDataset]:
@@ -197,8 +209,8 @@ def main(stage: Stage) -> None:
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
     layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=TARGET)
     with stage.saving() as place:
-        smaller = cut_to_size(layers, recipe.file.megabytes)
-        StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=smaller)
+        halves = {name: tensor.half() for name, tensor in layers.items()}
+        StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)
 
 
 if __name__ == "__main__":
