@@ -247,7 +247,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         features, reasons = model.encode_touches(pixels, model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
-        reasons = reasons or [None] * len(pixels)
         if background is not None:
             untouched = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
             reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.world import ATTRIBUTES
@@ -40,13 +40,12 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
 def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
     """Gives a model the distance of touches, by class where materials are known, and its threshold."""
 
+    stem = model.touch_model.stem
+
     def statistics(images: Iterable[np.ndarray]) -> Tensor:
         pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
         parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
-        found = [
-            touch_statistics(model.touch_model.stem(part.to(model.device)), denormalise_pixels(part)) for part in parts
-        ]
-        return torch.cat(found).cpu()
+        return torch.cat([touch_statistics(stem(part.to(model.device)), part) for part in parts]).cpu()
 
     cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
     pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
 from tests.benchmarks import quality
-from tests.benchmarks.error_and_time import cost_figures, our_call, speedup_figures, usual_call
+from tests.benchmarks.error_and_time import cost_figures, usual_way
 from tests.benchmarks.files_entered import functions_entered
 from tests.benchmarks.tables import MARKS, ROOT, card_settings, write_pages
 from tests.benchmarks.world import physics_figures
@@ -42,19 +42,15 @@ INPUTS = {"touch_embeds": torch.randn(2, 16, generator=torch.Generator().manual_
 def test_the_usual_way_makes_the_same_latents_from_the_same_start(pipe):
     noise = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
     call = {"num_inference_steps": 4, "guidance_scale": 3.0, "output_type": "latent", "latents": noise}
-    latents, seconds = usual_call(pipe, INPUTS, generator=torch.Generator().manual_seed(1), **call)
+    latents = usual_way(pipe)(**INPUTS, generator=torch.Generator().manual_seed(1), **call).images
     settings = {"timestep_spacing": "leading", "steps_offset": 1, "set_alpha_to_one": False, "clip_sample": False}
     own, pipe.scheduler = pipe.scheduler, DDIMScheduler.from_config(pipe.scheduler.config, **settings)
-    expected, _ = our_call(pipe, INPUTS, generator=torch.Generator().manual_seed(1), **call)
+    expected = pipe(**INPUTS, generator=torch.Generator().manual_seed(1), **call).images
     pipe.scheduler = own
     torch.testing.assert_close(latents, expected, rtol=1e-4, atol=1e-4)
-    assert 0 < seconds["denoising"] <= seconds["whole"]
 
 
-def test_a_speed_up_is_over_what_comes_as_close_and_costs_are_the_fewest_evaluations(pipe):
-    figures = speedup_figures(pipe, INPUTS, 16, 2.0, repeats=2, tried=(4, 8, 16), rtol=0.3)
-    assert figures["ours"]["error"] <= figures["baseline"]["error"]
-    assert figures["evaluations"] == 16 / figures["ours"]["evaluations"]
+def test_costs_are_the_fewest_evaluations_within_an_error(pipe):
     costs = cost_figures(pipe, INPUTS, (2.0, 1e-9), steps=(4, 8), seeds=1, rtol=0.3)["cost_at_error"]
     assert {error: row["steps"] for error, row in costs.items()} == {"2": 4}
 

@@ -26,13 +26,13 @@ def vae(request: pytest.FixtureRequest) -> Autoencoder:
 
 @torch.no_grad()
 def test_latents_are_shifted_and_scaled_and_decoding_undoes_it(vae: Autoencoder) -> None:
-    pixels = 2 * torch.rand(2, 3, 32, 32) - 1
+    pixels = 2 * torch.rand(9, 3, 32, 32) - 1
     given, latents = vae.encode(pixels), encode(vae, pixels)
     raw = given.latent_dist.mode() if isinstance(vae, AutoencoderKL) else next(iter(given.values()))
     torch.testing.assert_close(latents, 0.5 * (raw - (0.25 if isinstance(vae, AutoencoderKL) else 0.0)))
-    assert latents.shape == (2, vae.config.latent_channels, 32 // scale_factor(vae), 32 // scale_factor(vae))
+    assert latents.shape == (9, vae.config.latent_channels, 32 // scale_factor(vae), 32 // scale_factor(vae))
     torch.testing.assert_close(decode(vae, latents), vae.decode(raw).sample)
-    assert decode(vae, latents).shape == pixels.shape
+    assert decode(vae, latents).shape == pixels.shape and decode(vae, latents).is_contiguous()
 
 
 @torch.no_grad()

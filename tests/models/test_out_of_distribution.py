@@ -7,6 +7,7 @@ import torch
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, touch_statistics, warn_of_unknown
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World, draw_sensor
@@ -32,7 +33,7 @@ def test_pictures_are_unknown_and_touches_are_not(scene, dtype, tmp_path) -> Non
 
 
 def test_a_model_without_a_distance_says_nothing(model: UniTouchModel, inputs: dict) -> None:
-    assert model.encode_touches(**inputs["touch"])[1] == []
+    assert model.encode_touches(**inputs["touch"])[1] == [None] * len(inputs["touch"]["pixel_values"])
 
 
 def test_a_touch_is_compared_with_its_gel_at_rest() -> None:
@@ -47,7 +48,9 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     noise = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     mixed = torch.stack([noise[:, 0], 0.5 * noise[:, 0] + 0.5 * noise[:, 1], noise[:, 2]], dim=1)
     grey = noise[:, :1].expand(-1, 3, -1, -1)
-    statistics = touch_statistics(torch.ones(3, 2, 4, 4), torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
+    statistics = touch_statistics(
+        torch.ones(3, 2, 4, 4), normalise_pixels(torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
+    )
     assert (statistics[:, :2] == 1.0).all() and bool(torch.isfinite(statistics).all())
     statistics = statistics[:, 2:]
     expected = np.corrcoef(mixed.flatten(2)[0].numpy())[[0, 0, 1], [1, 2, 2]]

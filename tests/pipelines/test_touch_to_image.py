@@ -68,7 +68,8 @@ def test_a_background_takes_the_look_of_its_sensor_away(pipe, touch):
 @pytest.mark.parametrize(("fixture", "encode"), [("pipe", "encode_touch"), ("x_to_touch", "encode_condition")])
 def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode, monkeypatch):
     pipe, reasons = request.getfixturevalue(fixture), ["unlike anything known", None]
-    monkeypatch.setattr(UniTouchModel, "_unknown", lambda self, *given: reasons)
+    features = UniTouchModel.get_touch_features
+    monkeypatch.setattr(UniTouchModel, "encode_touches", lambda self, *given: (features(self, *given), reasons))
     for call in (pipe, getattr(pipe, encode)):
         with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[0\]`: unlike anything known\. .* a guess") as caught:
             made = call(touch=touch)

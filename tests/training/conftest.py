@@ -32,8 +32,8 @@ BLOCKS |= {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
 
 
 @pytest.fixture(autouse=True)
-def precision() -> None:
-    """Each test begins as a process does: accelerate keeps the precision of the first training."""
+def fresh_accelerator_state() -> None:
+    """Resets accelerate's state, which keeps the precision of the first training in a process."""
     AcceleratorState._reset_state()
 
 

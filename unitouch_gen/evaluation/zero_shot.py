@@ -111,7 +111,7 @@ class ZeroShotTouchClassifier:
             features: (B, D), of any length.
             modality: That they came from; its template is used.
             labels, template, top: See `__call__`.
-            unknown: What `UniTouchModel.encode_touches` says of each; nothing where it is empty.
+            unknown: The second output of `UniTouchModel.encode_touches`: why each is out of distribution, or `None`.
         """
         shares = (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
         best = shares.topk(min(top or len(labels), len(labels)))

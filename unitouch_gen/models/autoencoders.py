@@ -53,9 +53,10 @@ def encode(vae: Autoencoder, pixels: Tensor) -> Tensor:
 def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
     """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
     raw = (latents / vae.config.scaling_factor + _shift(vae)).to(vae.dtype)
-    # Convolutions on a CPU take two thirds of the time in this layout, and in parts that its caches hold.
+    # On a CPU, channels-last convolutions take two thirds of the time, and parts of 8 stay in its caches.
     parts = raw.to(memory_format=torch.channels_last).split(8) if raw.device.type == "cpu" else [raw]
-    return torch.cat([vae.decode(part, return_dict=False)[0].float() for part in parts])
+    pixels = torch.cat([vae.decode(part, return_dict=False)[0].float() for part in parts])
+    return pixels.contiguous()  # users may call `view`
 
 
 def _shift(vae: Autoencoder) -> float:

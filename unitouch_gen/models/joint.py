@@ -95,20 +95,25 @@ class UniTouchModel(PreTrainedModel):
 
         `sensor_ids` are indices in the bank, integers (B,), -1 for a sensor without tokens; `None` retrieves them.
         """
-        return self.encode_touches(pixel_values, sensor_ids)[0]
+        return self._encode_touches(pixel_values, sensor_ids)[0]
 
     @apply_forward_hook
     def encode_touches(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> tuple[Tensor, list[str | None]]:
-        """Embeddings as `get_touch_features` has them, and why each touch is out of distribution, or `None`.
+        """`get_touch_features`, and why each touch is out of distribution: `None` if it is not, or no one can tell."""
+        features, patches = self._encode_touches(pixel_values, sensor_ids)
+        if "touch" not in self.out_of_distribution:
+            return features, [None] * len(pixel_values)
+        distances = self.out_of_distribution["touch"](touch_statistics(patches.detach(), pixel_values))
+        threshold = self.config.ood_thresholds["touch"]["foreign"]
+        return features, [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 
-        There are no reasons without a fitted distance.
-        """
+    def _encode_touches(self, pixel_values: Tensor, sensor_ids: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, D), and the stem's output (B, width, h, w)."""
         touch_model, sensor_bank = self.load("touch")
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
         patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
-        features = sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids)
-        return features, self._unknown(patches.detach(), pixel_values)
+        return sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids), patches
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
@@ -162,15 +167,6 @@ class UniTouchModel(PreTrainedModel):
         prototypes = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
         prototypes = F.interpolate(prototypes.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
         return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
-
-    @torch.no_grad()
-    def _unknown(self, patches: Tensor, pixel_values: Tensor) -> list[str | None]:
-        if "touch" not in self.out_of_distribution:
-            return []
-        statistics = touch_statistics(patches, denormalise_pixels(pixel_values.float()))
-        distances = self.out_of_distribution["touch"](statistics.to(self.device))
-        threshold = self.config.ood_thresholds["touch"]["foreign"]
-        return [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from unitouch_gen.errors import UnfamiliarInputWarning
-from unitouch_gen.models.vit import local_mean
+from unitouch_gen.models.images import denormalise_pixels, local_mean
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming a touch."""
@@ -57,7 +57,8 @@ class RelativeDistance(nn.Module):
         return self.groups["known"](statistics) - self.groups["foreign"](statistics)
 
 
-def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
+@torch.no_grad()
+def touch_statistics(patches: Tensor, pixel_values: Tensor) -> Tensor:
     """What `RelativeDistance` compares, (B, width + 12).
 
     An encoder that overlooks differences between sensors overlooks what tells a photo from a touch. So these are the
@@ -67,9 +68,11 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
 
     Args:
         patches: Output of the touch encoder's stem, (B, width, h, w).
-        pixels: In [0, 1], (B, 3, H, W).
+        pixel_values: Normalised touches, (B, 3, H, W).
     """
-    detail = (pixels - local_mean(pixels, max(1, max(pixels.shape[-2:]) // 28))).flatten(2)
+    pixels = denormalise_pixels(pixel_values.float())
+    reach = max(1, max(pixels.shape[-2:]) // 28)  # a window of 7 % of the longer side
+    detail = (pixels - local_mean(pixels, reach)).flatten(2)
     covariance = (detail @ detail.mT / detail.shape[-1]).nan_to_num() + 1e-9 * torch.eye(3).to(pixels)
     deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
     red, green, _ = (covariance / (deviation[:, :, None] * deviation[:, None])).unbind(dim=1)
