@@ -39,13 +39,12 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
 @torch.no_grad()
 def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
     """Gives a model the distance of touches, by class where materials are known, and its threshold."""
-
-    stem = model.touch_model.stem
+    stem, weight = model.touch_model.stem, model.touch_model.projection.weight
 
     def statistics(images: Iterable[np.ndarray]) -> Tensor:
         pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
         parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
-        return torch.cat([touch_statistics(stem(part.to(model.device)), part) for part in parts]).cpu()
+        return torch.cat([touch_statistics(stem(part.to(weight)), part) for part in parts]).cpu()
 
     cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
     pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]

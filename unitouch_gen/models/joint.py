@@ -103,7 +103,7 @@ class UniTouchModel(PreTrainedModel):
         features, patches = self._encode_touches(pixel_values, sensor_ids)
         if "touch" not in self.out_of_distribution:
             return features, [None] * len(pixel_values)
-        distances = self.out_of_distribution["touch"](touch_statistics(patches.detach(), pixel_values))
+        distances = self.out_of_distribution["touch"](touch_statistics(patches, pixel_values))
         threshold = self.config.ood_thresholds["touch"]["foreign"]
         return features, [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 
