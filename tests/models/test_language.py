@@ -67,7 +67,7 @@ def test_what_is_added_is_the_gated_value_of_an_adapter_token(parts):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("mode", MODES)
 @torch.no_grad()
-def test_closed_gates_and_detaching_leave_every_bit_and_open_gates_do_not(parts, mode, dtype):
+def test_closed_gates_and_closing_leave_every_bit_and_open_gates_do_not(parts, mode, dtype):
     bridge, model = (part.to(dtype) for part in parts)
     before, logits = generate(model, **MODES[mode]), model(IDS).logits
     with bridge.attach(model, EMBEDS):
@@ -76,7 +76,7 @@ def test_closed_gates_and_detaching_leave_every_bit_and_open_gates_do_not(parts,
     bridge.gates.zero_()
     attached = bridge.attach(model, EMBEDS)
     assert torch.equal(generate(model, **MODES[mode]), before) and torch.equal(model(IDS).logits, logits)
-    attached.detach()
+    attached.close()
     assert torch.equal(model(IDS).logits, logits) and not torch.equal(open_, before)
     assert not any(module._forward_pre_hooks for module in model.modules())
 

@@ -34,12 +34,6 @@ class SwiGLU(nn.Module):
         return x + self.w2(F.silu(self.w1(normed)) * self.w3(normed))
 
 
-class Attachment(ExitStack):
-    """The hooks of a bridge in a language model; `detach()`, or the end of a `with` block, removes them."""
-
-    detach = ExitStack.close
-
-
 class LanguageBridge(ModelMixin, ConfigMixin):
     """Projection, residual blocks, a query of each layer, and a zero-initialised gate of each head.
 
@@ -82,10 +76,9 @@ class LanguageBridge(ModelMixin, ConfigMixin):
         intermediate_size: int | None = None,
     ) -> Self:  # fmt: skip
         """A new bridge into a language model."""
-        config = language_model.config.get_text_config()
-        layers = len(attentions_of(language_model))
-        heads = config.num_attention_heads
-        return cls(embedding_dim, config.hidden_size, layers, heads, num_blocks, intermediate_size)
+        config, layers = language_model.config.get_text_config(), len(attentions_of(language_model))
+        sizes = config.hidden_size, layers, config.num_attention_heads
+        return cls(embedding_dim, *sizes, num_blocks, intermediate_size)
 
     def forward(self, embeds: Tensor) -> Tensor:
         """Adapter tokens a_l (B, L, C) of embeddings (B, D), of which only the direction counts."""
@@ -95,18 +88,18 @@ class LanguageBridge(ModelMixin, ConfigMixin):
     def check_fits(self, language_model: PreTrainedModel) -> list[Any]:
         """The language model's attentions; raises `InvalidInputError` if it has no `o_proj`, or other sizes."""
         attentions = attentions_of(language_model)
-        config, ours = language_model.config.get_text_config(), self.config
+        config = language_model.config.get_text_config()
         theirs = {"hidden_size": config.hidden_size, "num_heads": config.num_attention_heads}
         for name, size in {"num_layers": len(attentions), **theirs}.items():
-            if ours[name] != size:
-                raise InvalidInputError(
-                    f"`language_bridge` has `{name}` {ours[name]}, but the language model {size}; pass the bridge that "
-                    "was made for it."
-                )
+            if self.config[name] != size:
+                mine = f"`language_bridge` has `{name}` {self.config[name]}"
+                raise InvalidInputError(f"{mine}, but the language model {size}; pass the bridge that was made for it.")
         return attentions
 
-    def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> Attachment:
-        """Lets a language model answer about embeddings (B, D), one for each of its inputs, until it is detached.
+    def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> ExitStack:
+        """Lets a language model answer about embeddings (B, D), one for each of its inputs.
+
+        The end of a `with` block, or `close()`, undoes it.
 
         `generate` may repeat each input, as it does for beams and several answers. While gradients are on, they reach
         the bridge. Not for several threads at once: each would see what all have attached.
@@ -116,7 +109,7 @@ class LanguageBridge(ModelMixin, ConfigMixin):
             NonFiniteError: If an adapter token is not finite.
         """
         attentions = self.check_fits(language_model)
-        adapters, attached = self(embeds), Attachment()
+        adapters, attached = self(embeds), ExitStack()
         if not bool(adapters.isfinite().all()):
             raise NonFiniteError("The adapter of an embedding is not finite; run the bridge in float32 or bfloat16.")
         for layer, attention in enumerate(attentions):
@@ -157,13 +150,9 @@ class AdapterHook:
 
 def attentions_of(language_model: PreTrainedModel) -> list[Any]:
     """The attentions of a causal language model in order; raises `InvalidInputError` if none ends in `o_proj`."""
-    found = []
-    for module in language_model.modules():
-        if hasattr(module, "o_proj") and (hasattr(module, "v_proj") or hasattr(module, "qkv_proj")):
-            found.append(module)
+    ending = [module for module in language_model.modules() if hasattr(module, "o_proj")]
+    found = [module for module in ending if hasattr(module, "v_proj") or hasattr(module, "qkv_proj")]
     if not found:
-        raise InvalidInputError(
-            f"`language_model` is a {type(language_model).__name__}, whose attention has no `o_proj`; pass one "
-            "like LLaMA."
-        )
+        kind = type(language_model).__name__
+        raise InvalidInputError(f"`language_model` is a {kind}, whose attention has no `o_proj`; pass one like LLaMA.")
     return found
