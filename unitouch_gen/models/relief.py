@@ -30,7 +30,8 @@ def relief(pixel_values: Tensor) -> Tensor:
     Returns:
         (B, 3, H, W) within +-6; that heights rise toward the sensor is a guess, right in most touches.
     """
-    smooth = _smooth(pixel_values)
+    rows, columns = (_local_lines(side, pixel_values) for side in pixel_values.shape[-2:])
+    smooth = rows @ pixel_values @ columns.T  # what lamps and gel make of it before anything small presses into it
     detail = pixel_values - smooth
     height, width = detail.shape[-2:]
     with torch.no_grad():
@@ -55,12 +56,6 @@ class BesideRelief(nn.Module):
         with torch.autocast(pixel_values.device.type, enabled=False):
             seen = relief(pixel_values.float()).to(pixel_values.dtype)
         return torch.cat([0.15 * pixel_values, seen], dim=1)
-
-
-def _smooth(pixels: Tensor) -> Tensor:
-    """What lamps and gel make of a touch before anything small presses into it, (B, C, H, W)."""
-    rows, columns = (_local_lines(side, pixels) for side in pixels.shape[-2:])
-    return rows @ pixels @ columns.T
 
 
 def _local_lines(side: int, like: Tensor) -> Tensor:

@@ -107,24 +107,23 @@ class Residual(nn.Module):
         return F.relu(x + self.norm(self.convolution(x)))
 
 
-def residual_stem(
-    hidden_size: int, channels: int, patch_size: int, side: int, *, of_touch: bool = False
-) -> list[nn.Module]:
+def residual_stem(config: Any, side: int) -> list[nn.Module]:
     """Local contrast, or relief of touches; for each halving a stride-2 convolution and a residual one; a projection.
 
     Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as
-    drawn ones do are then hardly told apart. `channels` and `side` are of the images, the shorter side.
+    drawn ones do are then hardly told apart. `side` is the images' shorter one.
     """
+    of_touch, channels = getattr(config, "stem", "residual") == "relief", config.num_channels
     layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
     channels = channels + RELIEF_CHANNELS if of_touch else 2 * channels
-    halvings = patch_size.bit_length() - 1
+    halvings = config.patch_size.bit_length() - 1
     for level in range(halvings):
-        width = max(hidden_size >> (halvings - 1 - level), 16)  # twice as many each time, up to `hidden_size`
+        width = max(config.hidden_size >> (halvings - 1 - level), 16)  # twice as many each time, up to `hidden_size`
         layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
         layers += [Residual(width)]
         channels = width
     # The last norm takes away what all images share, which would be most of their mean.
-    return [*layers, nn.Conv2d(channels, hidden_size, 1), nn.BatchNorm2d(hidden_size)]
+    return [*layers, nn.Conv2d(channels, config.hidden_size, 1), nn.BatchNorm2d(config.hidden_size)]
 
 
 class PatchProjection(nn.Module):
@@ -133,11 +132,11 @@ class PatchProjection(nn.Module):
     A class token of a small transformer learns what is in a view long before it learns where.
     """
 
-    def __init__(self, width: int, patches: int, channels: int, projection_dim: int, eps: float):
+    def __init__(self, config: Any, patches: int):
         super().__init__()
-        self.norm = StreamNorm(width, eps=eps)
-        self.reduce = nn.Linear(width, channels)
-        self.project = nn.Linear(patches * channels, projection_dim, bias=False)
+        self.norm = StreamNorm(config.hidden_size, eps=config.layer_norm_eps)
+        self.reduce = nn.Linear(config.hidden_size, config.patch_channels)
+        self.project = nn.Linear(patches * config.patch_channels, config.projection_dim, bias=False)
 
     def forward(self, patches: Tensor) -> Tensor:
         return self.project(F.gelu(self.reduce(self.norm(patches))).flatten(1))
@@ -157,13 +156,12 @@ class UniTouchViT(nn.Module):
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width, depth = config.hidden_size, config.num_hidden_layers
-        channels, patch = config.num_channels, config.patch_size
         self.begins_at_mean = config.stem != "patch"
         if self.begins_at_mean:
-            side, of_touch = min(config.image_height, config.image_width), config.stem == "relief"
-            self.stem: nn.Module = nn.Sequential(*residual_stem(width, channels, patch, side, of_touch=of_touch))
+            side = min(config.image_height, config.image_width)
+            self.stem: nn.Module = nn.Sequential(*residual_stem(config, side))
         else:  # as in CLIP, no bias
-            self.stem = nn.Conv2d(channels, width, patch, config.patch_stride, bias=False)
+            self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
         self.stem_norm = nn.LayerNorm(width, eps=1e-5) if config.stem_norm else None
         rows, columns = config.grid
         self.class_token = nn.Parameter(torch.zeros(1, 1, width))
@@ -171,10 +169,7 @@ class UniTouchViT(nn.Module):
         self.blocks = nn.ModuleList(Block(config, config.drop_path * i / max(depth - 1, 1)) for i in range(depth))
         self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
-        self.patch_projection: PatchProjection | None = None
-        if config.patch_channels:
-            sizes = (width, rows * columns, config.patch_channels, config.projection_dim)
-            self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps)
+        self.patch_projection = PatchProjection(config, rows * columns) if config.patch_channels else None
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None, stemmed: bool = False) -> Tensor:
         """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W), or of the stem's output if `stemmed`.
@@ -241,10 +236,9 @@ class Stem(nn.Sequential):
 class StemmedEmbeddings(CLIPVisionEmbeddings):
     """Patch tokens made by a stem; the class token begins at their mean."""
 
-    def __init__(self, config: CLIPVisionConfig):
+    def __init__(self, config: Any):
         super().__init__(config)
-        sizes: tuple[int, ...] = (config.hidden_size, config.num_channels, config.patch_size, config.image_size)  # type: ignore[assignment]
-        self.patch_embedding = Stem(*residual_stem(*sizes)).apply(initialise)  # type: ignore[assignment, call-arg]
+        self.patch_embedding = Stem(*residual_stem(config, config.image_size)).apply(initialise)  # type: ignore[assignment]
 
     def forward(self, pixel_values: Tensor, interpolate_pos_encoding: bool = False) -> Tensor:
         return begun_at_the_mean(super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding))
@@ -262,11 +256,9 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
         super().__init__(config)
         self.vision_model.embeddings = StemmedEmbeddings(config)
         self.patch_projection: PatchProjection | None = None
-        if channels := getattr(config, "patch_channels", 0):
-            size: Any = config  # whose sizes are annotated as pairs, too
-            patches = (size.image_size // size.patch_size) ** 2
-            sizes = (config.hidden_size, patches, channels, config.projection_dim)
-            self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps).apply(initialise)
+        if getattr(config, "patch_channels", 0):
+            patches = self.vision_model.embeddings.num_patches
+            self.patch_projection = PatchProjection(config, patches).apply(initialise)
 
     def forward(self, pixel_values: Tensor, **options: Any) -> Any:
         made: Any = super().forward(pixel_values, **options)
