@@ -66,4 +66,3 @@ def test_unknown_touches_are_told_by_their_places_in_one_line() -> None:
     many = "^`touch.1.`: nothing is touched; `touch.2.`: unlike anything known; .* and 3 more. What"
     with pytest.warns(UnfamiliarInputWarning, match=many):
         warn_of_unknown([None, UNTOUCHED, *5 * [UNLIKE]], 2)
-    warn_of_unknown([None, None], 2)

@@ -58,6 +58,5 @@ class ContactClassifier(ResNetForImageClassification):
 
     def scale_of_attributes(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
         """Mean and deviation of each attribute in training, (K,)."""
-        values = (self.config.attribute_means, self.config.attribute_deviations)
-        mean, deviation = (torch.tensor(value, device=device) for value in values)
-        return mean, deviation
+        scale = torch.tensor([self.config.attribute_means, self.config.attribute_deviations], device=device)
+        return scale[0], scale[1]

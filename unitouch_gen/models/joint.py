@@ -25,32 +25,29 @@ from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initial
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
-MODULES: dict[str, tuple[str, ...]] = {
+MODULES: dict[str, tuple[str, ...]] = {  # sub-modules of each modality; also the key prefixes on disk
     "image": ("vision_model",),
     "text": ("text_model",),
     "audio": ("audio_model",),
     "touch": ("touch_model", "sensor_bank"),
 }
-"""Sub-modules of each modality; also the key prefixes on disk."""
 
-_READING = threading.Lock()
-"""Held while an encoder is read: threads that share a model do it once."""
+_READING = threading.Lock()  # held while an encoder is read: threads that share a model do it once
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
     """The `MODULES` of a modality: CLIP for image and text, `UniTouchViT` for audio and touch."""
-    made: tuple[nn.Module, ...]
     if modality == "image":
         stemmed = getattr(config.vision_config, "stem", "patch") == "residual"
-        made = ((StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection)(config.vision_config),)
-    elif modality == "text":
-        made = (CLIPTextModelWithProjection(config.text_config),)
-    elif modality == "audio":
-        made = (UniTouchViT(config.audio_config),)
-    else:
-        sizes = config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size
-        made = (UniTouchViT(config.touch_config), SensorBank(config.sensors, *sizes, config.sensor_reaches))
-    return dict(zip(MODULES[modality], made, strict=True))
+        kind: Any = StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection
+        return {"vision_model": kind(config.vision_config)}
+    if modality == "text":
+        return {"text_model": CLIPTextModelWithProjection(config.text_config)}
+    if modality == "audio":
+        return {"audio_model": UniTouchViT(config.audio_config)}
+    sizes = config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size
+    bank = SensorBank(config.sensors, *sizes, config.sensor_reaches)
+    return {"touch_model": UniTouchViT(config.touch_config), "sensor_bank": bank}
 
 
 class UniTouchModel(PreTrainedModel):

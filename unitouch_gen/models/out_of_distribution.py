@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models.images import denormalise_pixels, local_mean
 
-UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
-"""Why a model abstains from naming a touch."""
+UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"  # why a model abstains from naming a touch
 
 
 class Gaussians(nn.Module):
@@ -88,6 +87,4 @@ def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int) -> None:
     rows = [row for row, reason in enumerate(reasons) if reason]
     named = "; ".join(f"`touch{f'[{row}]' * (len(reasons) > 1)}`: {reasons[row]}" for row in rows[:3])
     more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
-    if rows:
-        message = f"{named}{more}. What is made of it is a guess."
-        warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)
+    warnings.warn(f"{named}{more}. What is made of it is a guess.", UnfamiliarInputWarning, stacklevel=stacklevel)

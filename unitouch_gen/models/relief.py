@@ -13,8 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-RELIEF_CHANNELS = 3
-"""Two slopes and a height."""
+RELIEF_CHANNELS = 3  # two slopes and a height
 
 
 def relief(pixel_values: Tensor) -> Tensor:
@@ -97,9 +96,8 @@ def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
 def _uprightness(smooth: Tensor, detail: Tensor, slopes: Tensor, heights: Tensor) -> Tensor:
     """Above 0 where heights seem to rise toward the sensor, (B,)."""
     shaded = detail.flatten(2) @ slopes.flatten(2).mT  # how each channel follows the slopes, (B, C, 2)
-    glow = torch.stack(
-        [(smooth[..., -1] - smooth[..., 0]).mean(2), (smooth[..., -1, :] - smooth[..., 0, :]).mean(2)], 2
-    )
+    rises = (smooth[..., -1] - smooth[..., 0]).mean(2), (smooth[..., -1, :] - smooth[..., 0, :]).mean(2)
+    glow = torch.stack(rises, dim=2)
     skewness = heights.pow(3).mean(dim=(1, 2)) / heights.square().mean(dim=(1, 2)).clamp_min(1e-9) ** 1.5
     # Gels are brightest near their lamps; what rises toward a lamp faces away from it, and darkens.
     return skewness - 1.5 * F.cosine_similarity(shaded.flatten(1), glow.flatten(1), dim=1)
