@@ -15,45 +15,42 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import files_below, read_table
+from unitouch_gen.files import read_table
 from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in
 
 LOOKS_LIKE = ()
 FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
+COLUMNS = (*FRAMES, *TEXTS, "sound")
 SPLITS = ("train", "val", "test")
 
 
 def read(folder: Path) -> Iterator[Record | str]:
-    """What its table names, or the images in it; and what is left out."""
+    """What its table names, or the images in it; and which images are left out."""
     tables = [file for file in found(folder, "*") if file.suffix.lower() in (".csv", ".tsv")]
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     records = list(read_rows(folder, tables[0]) if tables else read_tree(folder))
     yield from records
-    used = set(map(str, tables)).union(*(record.files for record in records))
-    others = set(map(str, files_below(folder))) - used
-    unread = [] if tables else [image for image in images_in(folder, "**/*") if str(image) in others]
-    if unread:
-        names = few([image.relative_to(folder).as_posix() for image in unread])
-        yield f"{len(unread)} images are not read, as no touch in `touch` has their names: {names}"
-    if len(others) > len(unread):
-        yield f"{len(others) - len(unread)} other files in {folder} are left out."
+    used = set[str]().union(*(record.files for record in records))
+    images = [] if tables else [image for image in images_in(folder, "**/*") if str(image) not in used]
+    if images:
+        names = few([image.relative_to(folder).as_posix() for image in images])
+        yield f"{len(images)} images are not read, as no touch in `touch` has their names: {names}"
 
 
 def read_rows(folder: Path, table: Path) -> Iterator[Record]:
     """What each row of the table names; columns that are none of a record's are labels."""
     rows = read_table(table)
-    touch = column_of(table, rows[0], ("touch", "tactile", "file", "filename", "path", "image"))
-    columns = {name: name for name in (*FRAMES, "sound") if name in rows[0]} | {"touch": touch}
-    labels = [name for name in rows[0] if name not in {*columns.values(), *TEXTS}]
+    column_of(table, rows[0], ("touch",))
     for row in rows:
-        known: dict[str, Any] = {"id": row[touch]} | {name: row[name] or None for name in TEXTS if name in row}
-        known |= {name: str(folder / row[column]) for name, column in columns.items() if row[column]}
-        known |= {name: Frame(known[name]) for name in FRAMES if name in known}
+        known: dict[str, Any] = {"id": row["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
+        known |= {name: Frame(str(folder / row[name])) for name in FRAMES if row.get(name)}
+        known |= {"sound": str(folder / row["sound"])} if row.get("sound") else {}
         if known.get("split") not in (None, *SPLITS):
             raise InvalidInputError(f"{str(table)!r} has the split {known['split']!r}; there are {', '.join(SPLITS)}.")
-        yield Record(**known, labels={label: row[label] for label in labels if row[label] not in ("", "-1")})
+        labels = {name: text for name, text in row.items() if name not in COLUMNS and text not in ("", "-1")}
+        yield Record(**known, labels=labels)
 
 
 def read_tree(folder: Path) -> Iterator[Record]:
