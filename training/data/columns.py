@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Relit
 from unitouch_gen.training.data.records import Record, few
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
@@ -81,11 +81,13 @@ class Rendered:
         return len(self.material)
 
 
+FIELDS = {"image": "picture", "audio": "sound", "text": "caption"}
+"""Fields of a record by columns, where their names differ."""
+
+
 def has(record: Record, need: str) -> bool:
     """Whether a record has a column that a stage may need: touch, image, background, audio, text, material, sensor."""
-    if need == "material":
-        return need in record.labels
-    return getattr(record, {"image": "picture", "audio": "sound", "text": "caption"}.get(need, need)) is not None
+    return need in record.labels if need == "material" else getattr(record, FIELDS.get(need, need)) is not None
 
 
 def columns_of(
@@ -148,10 +150,9 @@ def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.
     """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), once into the cache."""
 
     def write(arrays: Arrays, _: Path) -> None:
-        done = 0
-        for pictures in tqdm(source.relit(split, seen.image.shape[-1]), f"{source.name}, relit", mininterval=5):
-            arrays["image"][done : done + len(pictures)] = as_bytes(pictures)
-            done += len(pictures)
+        scenes = source.rendered(split, seen.image.shape[-1], "image", kind=Relit)
+        for group, (scene, _) in enumerate(tqdm(scenes, f"{source.name}, relit", mininterval=5)):
+            arrays["image"][GROUP * group :][:GROUP] = as_bytes(scene.image)
 
     folder = Path(cache) / f"{source.name}-{split}-relit-{seen.fingerprint}"
     return mapped(folder, len(seen), {"image": (np.uint8, *seen.image.shape[1:])}, write)["image"]
@@ -168,25 +169,35 @@ def decoded(
     """
     size, mel = processor.image_size, processor.audio
     side = touch_size or size
-    kinds: dict[str, tuple[Callable[[Record], Any], tuple[Any, ...]]] = {
-        "image": (lambda record: square(record.picture, size), (np.uint8, 3, size, size)),
-        "touch": (lambda record: square(record.touch, side), (np.uint8, 3, side, side)),
-        "background": (lambda record: square(record.background, side), (np.uint8, 3, side, side)),
-        "audio": (
-            lambda record: processor.sounds([sound_of(record, data)], name=str(record.sound))[0, 0],
-            (np.float16, 1, mel.mel_bins, mel.frames),
-        ),
+    kinds: dict[str, tuple[Any, ...]] = {
+        "image": (np.uint8, 3, size, size),
+        **dict.fromkeys(("touch", "background"), (np.uint8, 3, side, side)),
+        "audio": (np.float16, 1, mel.mel_bins, mel.frames),
     }
+
+    def decode(name: str, arrays: Arrays, _: Path) -> None:
+        rows = arrays["values"]
+
+        def decode_row(row: int) -> None:
+            value = getattr(data[row], FIELDS.get(name, name))
+            if name == "audio":
+                rows[row] = processor.sounds([sound_of(data[row], data)], name=value)[0, 0]
+            else:
+                rows[row] = as_bytes(centre_rectangle(value.read(), *rows.shape[2:]))
+
+        if broken := for_each(decode_row, data):
+            reasons = few([*broken.values()])
+            raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
+
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
     state = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
     fingerprint = hashlib.sha256(state.encode()).hexdigest()[:16]
     columns: dict[str, Any] = dict.fromkeys(kinds)
-    for name, (read, (dtype, *shape)) in kinds.items():
+    for name, kind in kinds.items():
         if name in needs:
             folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
-            decode = partial(decode_rows, data, read)
-            columns[name] = mapped(folder, len(data), {"values": (dtype, *shape)}, decode)["values"]
+            columns[name] = mapped(folder, len(data), {"values": kind}, partial(decode, name))["values"]
     places = [materials.index(name) if name in materials else -1 for name in data.materials]
     return Rendered(
         **columns,
@@ -197,25 +208,9 @@ def decoded(
     )
 
 
-def decode_rows(data: RecordSet, read: Callable[[Record], Any], arrays: Arrays, _: Path) -> None:
-    """Fills "values" with what `read` makes of every record."""
-
-    def read_row(row: int) -> None:
-        arrays["values"][row] = read(data[row])
-
-    if broken := for_each(read_row, data):
-        reasons = few(list(broken.values()))
-        raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
-
-
 def as_bytes(pixels: Tensor) -> np.ndarray:
     """Pixels in [0, 1] as uint8."""
     return (pixels * 255).round().byte().numpy()
-
-
-def square(frame: Any, size: int) -> np.ndarray:
-    """The middle of a frame, uint8 (3, S, S)."""
-    return as_bytes(centre_rectangle(frame.read(), size, size))
 
 
 def sound_of(record: Record, data: RecordSet) -> Any:

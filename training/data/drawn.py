@@ -27,7 +27,7 @@ GROUP = 16
 
 
 class Relit(World):
-    """The same contacts under other lamps."""
+    """The same contacts, each under the lamp and white balance of the next one."""
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
         draws = super().draw(material, object_, contact)
@@ -70,9 +70,11 @@ class DrawnContacts:
         first = draw_sensor(self.seed, number) if self.sensor is None else SENSORS[self.sensor]
         return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
 
-    def rendered(self, split: str, size: int, *modalities: str) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
+    def rendered(
+        self, split: str, size: int, *modalities: str, kind: type[World] = World
+    ) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
         """Scenes of sixteen contacts each, with what was asked for, and their pairs of sensors."""
-        world = World(self.seed, image_size=size)
+        world = kind(self.seed, image_size=size)
         for group, names in enumerate(zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True)):
             sensors = self.pair(split, group)
             yield world.render(*names, modalities=modalities, sensors=sensors), sensors
@@ -92,12 +94,6 @@ class DrawnContacts:
         groups = range(-(-len(self.contacts(split)[0]) // GROUP))
         pairs = [self.pair(split, group) for group in groups]
         return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
-
-    def relit(self, split: str, size: int) -> Iterator[Tensor]:
-        """Pictures (n, 3, S, S) of the scenes, each under the lamp and white balance of the next contact."""
-        world = Relit(self.seed, image_size=size)
-        for names in zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True):
-            yield world.render(*names, modalities=("image",)).image  # type: ignore[misc]
 
     def captions(self, split: str, variants: int) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them that of its scene."""

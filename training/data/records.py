@@ -82,7 +82,7 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def frame_at(file: Path) -> Frame | None:
-    """An image file, if it is there."""
+    """The image in a file, if it is there."""
     return Frame(str(file)) if file.is_file() else None
 
 
@@ -115,8 +115,7 @@ class Video:
             self.place += 1
             if self.place == index:
                 return pixels
-        count, self.place = self.place + 1, -1
-        raise ValueError(f"the video has {count} frames, but not number {index}")
+        raise ValueError(f"the video has {self.place + 1} frames, but not number {index}")
 
 
 def frames_in(path: str) -> int:
