@@ -57,10 +57,6 @@ class ImageTextObjective(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / model.config.temperature)))
         self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if settings.attributes else None
 
-    @property
-    def trained(self) -> nn.Module:
-        return self
-
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = batches.shift_pixels(batch["image"].float() / 255, 4)
         raw = batches.jitter_colours(raw, gain=0.08, offset=0.03)

@@ -1,10 +1,10 @@
 """The one trainer: a loop around an objective, with accelerate, a cosine schedule, EMA, checkpoints and resume.
 
-An objective is an `nn.Module` whose `forward(batch)` returns a dict of scalar tensors with a `loss`, and whose
-`trained` module is what the optimiser changes. A batch follows from the number of its step, as do noise and
-augmentation, so a run that was killed goes on with exactly the batches it would have seen. `accelerate launch` runs it
-in several processes, by `DistributedDataParallel`: each works on its rows of a batch, with noise of its own, and
-gradients are averaged.
+An objective is an `nn.Module` whose `forward(batch)` returns a dict of scalar tensors with a `loss`. Its `trained`
+module is what the optimiser changes, or all of it if it has none. A batch follows from the number of its step, as do
+noise and augmentation, so a run that was killed goes on with exactly the batches it would have seen. `accelerate
+launch` runs it in several processes, by `DistributedDataParallel`: each works on its rows of a batch, with noise of its
+own, and gradients are averaged.
 """
 
 import json
@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, Self
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
-from accelerate.utils import set_seed
+from accelerate.utils import send_to_device, set_seed
 from diffusers.training_utils import EMAModel
 from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 from torch import nn
@@ -87,7 +87,7 @@ class Trainer:
         self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes
         if config.batch_size % processes:
             raise InvalidInputError(f"`batch_size` is {config.batch_size}; take a multiple of {processes} processes.")
-        self.trained: nn.Module = objective.trained  # type: ignore[assignment]
+        self.trained: nn.Module = getattr(objective, "trained", objective)
         if config.gradient_checkpointing:
             checkpoint_gradients(self.trained)
         optimizer = _optimizer(self.trained, config)
@@ -121,6 +121,7 @@ class Trainer:
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode."""
         config, started = self.config, time.monotonic() - self.seconds
+        self.output.mkdir(parents=True, exist_ok=True)
         if self.main and self.step == 0:  # what an earlier run left
             (self.output / "log.jsonl").unlink(missing_ok=True)
             shutil.rmtree(self.output / "checkpoints", ignore_errors=True)
@@ -132,15 +133,19 @@ class Trainer:
                 self.step += 1
                 self.seconds = time.monotonic() - started
                 steps.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
-                if self.step % 20 == 0 or self.step == self.steps:
-                    self._log({"rate": float(self.schedule.get_last_lr()[0]), **losses})
+                if self.main and (self.step % 20 == 0 or self.step == self.steps):
+                    rate = float(self.schedule.get_last_lr()[0])
+                    line = {"step": self.step, "seconds": round(self.seconds, 1), "rate": rate, **losses}
+                    with (self.output / "log.jsonl").open("a") as log:
+                        log.write(json.dumps(line) + "\n")
                 if self.step % config.save_every == 0 or self.step == self.steps:
                     self.save()
         if self.ema is not None:
             self.ema.copy_to(self.trained.parameters())
             # Batch norms have gathered the statistics of the raw weights. Without a batch norm this does nothing.
             first = range(min(100, self.steps))
-            update_bn((self._placed(self.dataset[self._rows(step)]) for step in first), self.objective)
+            device = self.accelerator.device
+            update_bn((send_to_device(self.dataset[self._rows(step)], device) for step in first), self.objective)
         self.objective.eval()
         self.accelerator.end_training()
 
@@ -150,11 +155,11 @@ class Trainer:
         process = self.accelerator.process_index
         set_seed((self.config.seed * 1_000_003 + process * 500_000_003 + self.step) % 2**32)
         # On a CPU, attention as two products: its fused backward in bf16 takes a quarter of a small UNet's step.
-        on_cpu = self.accelerator.device.type == "cpu"
-        with sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext():
+        device = self.accelerator.device
+        with sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" else nullcontext():
             with self.accelerator.autocast():
-                losses = self.objective(self._placed(batch))
-            detached = {key: value.detach().float().to(self.accelerator.device) for key, value in losses.items()}
+                losses = self.objective(send_to_device(batch, device))
+            detached = {key: value.detach().float().to(device) for key, value in losses.items()}
             means: Any = self.accelerator.reduce(detached, "mean")
             if not bool(means["loss"].isfinite()):
                 raise NonFiniteError(
@@ -189,15 +194,6 @@ class Trainer:
         indices = self.indices_of(step)
         share = len(indices) // self.accelerator.num_processes
         return [*indices[self.accelerator.process_index * share :][:share]]
-
-    def _placed(self, batch: Batch) -> Batch:
-        return {key: value.to(self.accelerator.device) for key, value in batch.items()}
-
-    def _log(self, figures: Mapping[str, float]) -> None:
-        if self.main:
-            self.output.mkdir(parents=True, exist_ok=True)
-            with (self.output / "log.jsonl").open("a") as log:
-                log.write(json.dumps({"step": self.step, "seconds": round(self.seconds, 1), **figures}) + "\n")
 
 
 def checkpoints_in(output: Path) -> list[Path]:
