@@ -48,22 +48,13 @@ def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-# Of diffusers' multistep schedulers and spacings, these do best in the number of steps above.
-SCHEDULERS: dict[str, tuple[Any, dict[str, bool]]] = {
-    "touch-to-image": (DEISMultistepScheduler, {"use_karras_sigmas": True}),
-    "x-to-touch": (UniPCMultistepScheduler, {"use_exponential_sigmas": True}),
-}
-
-
-def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> None:
+def write_generator(source: Path, target: Path, defaults: dict[str, Any], kind: Any, spacing: str) -> None:
     """Writes what only one pipeline has: its networks, its defaults, and a scheduler over the trained schedule."""
     for part in ("unet", "image_normalizer", "image_noising_scheduler", "backgrounds"):
         if (source / part).is_dir():
             half_folder(source / part, target / part)
     config = DDPMScheduler.from_pretrained(source / "scheduler").config
-    trained = {name: config[name] for name in TRAINED}
-    kind, spacing = SCHEDULERS[target.name]
-    kind(**trained, **spacing).save_pretrained(target / "scheduler")
+    kind(**{name: config[name] for name in TRAINED}, **{spacing: True}).save_pretrained(target / "scheduler")
     write_json(defaults, target / "defaults.json")
 
 
@@ -101,12 +92,14 @@ def assemble(
         halved(parts, place / "joint" / "model.safetensors")
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(models[stage], place / stage.replace("_", "-"))
-        write_generator(models["unclip"], place / "touch-to-image", TOUCH_TO_IMAGE)
+        # Of diffusers' multistep schedulers and spacings, these do best in the number of steps above.
+        pictures = (TOUCH_TO_IMAGE, DEISMultistepScheduler, "use_karras_sigmas")
+        write_generator(models["unclip"], place / "touch-to-image", *pictures)
         (place / "stylization").mkdir()
         write_json(STYLIZATION, place / "stylization" / "defaults.json")
         ldm = models["touch_ldm"]
-        sensors = json.loads((ldm / "sensors.json").read_text())
-        write_generator(ldm, place / "x-to-touch", {"sensors": sensors, **X_TO_TOUCH})
+        settings = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
+        write_generator(ldm, place / "x-to-touch", settings, UniPCMultistepScheduler, "use_exponential_sigmas")
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
         half_folder(models["touch_llm"], place / "touch-to-text")
         write_json({"prompt_template": PROMPT}, place / "touch-to-text" / "defaults.json")
