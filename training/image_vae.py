@@ -107,8 +107,9 @@ def make_autoencoder(model: Arguments) -> Autoencoder:
     return build("model", kind, {key: value for key, value in model.items() if key != "class"})
 
 
-def main(stage: Stage, modality: str = "image") -> None:
+def main(stage: Stage) -> None:
     recipe: AutoencoderRecipe = stage.recipe
+    modality = "touch" if stage.name == "touch_vae" else "image"
     init, crop = stage.folders.get("init"), recipe.augment.crop
     vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):

@@ -99,8 +99,9 @@ def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()
     return ArrayDataset(pixels=pixels, material=np.concatenate(material), **read)
 
 
-def main(stage: Stage, modality: str = "image") -> None:
+def main(stage: Stage) -> None:
     recipe: ClassifierRecipe = stage.recipe
+    modality = "touch" if stage.name == "touch_classifier" else "image"
     labels = dict(enumerate(material_names(stage.sources)))
     numbers = {name: number for number, name in labels.items()}
     config = build("model", ResNetConfig, recipe.model, id2label=labels, label2id=numbers)

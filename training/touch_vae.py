@@ -3,12 +3,8 @@
 python -m unitouch_gen.training.touch_vae --output runs/touch_vae
 """
 
-from functools import partial
-
-from unitouch_gen.training import image_vae
+from unitouch_gen.training.image_vae import AutoencoderRecipe, main
 from unitouch_gen.training.stages import run
 
-main = partial(image_vae.main, modality="touch")
-
 if __name__ == "__main__":
-    run("touch_vae", image_vae.AutoencoderRecipe, main)
+    run("touch_vae", AutoencoderRecipe, main)
