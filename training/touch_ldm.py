@@ -91,12 +91,6 @@ class TouchDiffusionObjective(nn.Module):
         return conditions
 
 
-def class_labels(splits: Sequence[Rendered], sensors: Sequence[str]) -> np.ndarray:
-    """Class of each sample's sensor, int64 (N,): its place in `sensors`, and behind them of one without a name."""
-    numbers = sensor_numbers(splits, sensors)
-    return np.where(numbers < 0, len(sensors), numbers)
-
-
 def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
     """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
     starts = np.cumsum([0, *(2 * -(-len(split) // GROUP) for split in splits)])
@@ -119,7 +113,7 @@ def inputs(
     columns = {
         "latents": latents_of("touch", [split.touch for split in splits]),
         "image_embeds": embeds,
-        "sensor": torch.from_numpy(class_labels(splits, sensors)),
+        "sensor": torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors))),
     }
     if not with_gels:
         return ArrayDataset(**columns), None

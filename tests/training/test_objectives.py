@@ -18,7 +18,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of, sensor_numbers
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
 from unitouch_gen.training.picture_classifier import SHOWN, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
@@ -228,4 +228,4 @@ def test_every_contact_knows_what_both_of_its_sensors_see_untouched(cache: Path,
             for which, sensor in enumerate(source.pair("train", row // 16)):
                 assert row % 16 or torch.equal(gels[place + which], untouched_gel(sensor, size))
         assert len(places) == len(split) and (places[0] == places[15] == places[16] - 2)
-    assert touch_ldm.class_labels(splits, ["digit"]).tolist() == [1] * len(splits[0]) + [0] * len(splits[1])
+    assert sensor_numbers(splits, ["digit"], unnamed=1).tolist() == [1] * len(splits[0]) + [0] * len(splits[1])

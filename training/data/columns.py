@@ -38,11 +38,6 @@ class SetConfig(Settings):
     materials: list[str] | None = None
     sampling_rate: PositiveInt | None = None
 
-    def read(self) -> list[RecordSet]:
-        """The records to train on, a part for each sensor."""
-        data = open_dataset(self.path, **self.model_dump(exclude={"path", "split"}))
-        return data.split("train", self.split).by_sensor()
-
 
 class DataConfig(Settings):
     """What a stage is trained on: data sets, the built-in world, or both."""
@@ -57,8 +52,11 @@ class DataConfig(Settings):
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
         if self.drawn is None and not self.sets:
             raise InvalidInputError("`data` names nothing to learn; give it `sets`, as [{path: FOLDER}], or `drawn`.")
-        drawn = self.drawn.sources() if self.drawn else []
-        return [*drawn, *(part for one in self.sets for part in one.read())]
+        sources: list[Source] = [*self.drawn.sources()] if self.drawn else []
+        for one in self.sets:
+            data = open_dataset(one.path, **one.model_dump(exclude={"path", "split"}))
+            sources += data.split("train", one.split).by_sensor()
+        return sources
 
 
 @dataclass
@@ -219,9 +217,9 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
 
 
-def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str]) -> np.ndarray:
-    """The place of each sample's sensor in `names`, int64 (N,); -1 where it has none."""
-    numbers = [names.index(split.sensor) if split.sensor in names else -1 for split in splits]
+def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str], unnamed: int = -1) -> np.ndarray:
+    """The place of each sample's sensor in `names`, int64 (N,); `unnamed` where it has none."""
+    numbers = [names.index(split.sensor) if split.sensor in names else unnamed for split in splits]
     return np.repeat(numbers, [len(split) for split in splits])
 
 
