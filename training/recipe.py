@@ -82,13 +82,13 @@ def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str,
     return changed
 
 
-def read(kind: type[SettingsKind], given: Any, section: str = "") -> SettingsKind:
+def read(kind: type[SettingsKind], given: Any) -> SettingsKind:
     """A recipe, or one section of it, as settings; an error names the first key that is wrong."""
     try:
         return kind.model_validate(given)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, [*filter(None, [section]), *first["loc"]])) or "recipe"
+        key = ".".join(map(str, first["loc"])) or "recipe"
         message = f"`{key}` is {describe(first['input'])}; {first['msg'].replace('Input should', 'it has to')}."
         if "error" in first.get("ctx", {}):  # of a check of ours
             message = f"In `{key}`, {first['ctx']['error']}"

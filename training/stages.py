@@ -222,17 +222,15 @@ def save_modalities(
     model: UniTouchModel, modalities: Sequence[str], processor: UniTouchProcessor, folder: Path
 ) -> None:
     """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
-    config = deepcopy(model.config)
-    if "touch" not in modalities:
+    config, names = deepcopy(model.config), [name for modality in modalities for name in MODULES[modality]]
+    if "touch" in modalities:
+        names.append("out_of_distribution")
+    else:
         config.ood_thresholds, config.sensor_reaches = {}, {}  # of other weights
     config.save_pretrained(folder)
     processor.save_pretrained(folder)
-    state = {
-        f"{name}.{key}": tensor.detach().contiguous().clone()
-        for modality in modalities
-        for name in (*MODULES[modality], *(["out_of_distribution"] if modality == "touch" else []))
-        for key, tensor in getattr(model, name).state_dict().items()
-    }
+    kept = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] in names}
+    state = {key: value.contiguous().clone() for key, value in kept.items()}
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
 
 

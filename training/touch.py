@@ -161,9 +161,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool =
     model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
-        chunks = (part[start : start + 1024] for part in parts for start in range(0, len(part), 1024))
-        total = sum(chunk.sum(axis=0, dtype=np.float64) for chunk in chunks)
-        mean = total / sum(len(part) for part in parts) / 255.0
+        mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / sum(map(len, parts)) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
         if reaches:

@@ -80,9 +80,8 @@ class UnclipObjective(nn.Module):
         else:
             level = torch.full((count,), self.level, device=device)
         gain = settings.gain + (1.0 - settings.gain) * torch.rand(count, 1, device=device)
-        labels = noise_embeddings(
-            gain * embeds, level, torch.randn_like(embeds), self.frozen[0], self.noising
-        )  # (B, 2 D)
+        noise = torch.randn_like(embeds)
+        labels = noise_embeddings(gain * embeds, level, noise, self.frozen[0], self.noising)  # (B, 2 D)
         hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
         return {"encoder_hidden_states": hidden, "class_labels": labels * kept[:, None]}
 
