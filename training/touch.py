@@ -13,6 +13,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import layout_distances
@@ -138,10 +139,8 @@ def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
     """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them."""
-    other = UniTouchModel.from_pretrained(folder)
-    if "touch" not in other.known_modalities:
-        raise InvalidInputError(f"`init` is {str(folder)!r}, with {other.known_modalities} and no touch encoder.")
-    transformer, bank = other.load("touch")
+    with reading("init", folder):
+        transformer, bank = UniTouchModel.from_pretrained(folder).load("touch")
     try:
         model.touch_model.load_state_dict(transformer.state_dict())
     except RuntimeError as error:

@@ -89,7 +89,7 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
         assert torch.equal(fresh.touch_model.state_dict()[name], tensor)
     kept, known = fresh.sensor_bank.tokens, model.sensor_bank
     assert torch.equal(kept[0], known.tokens[known.index("digit")]) and torch.equal(kept[1], before[1])
-    with pytest.raises(InvalidInputError, match=r"`init` is .* and no touch encoder"):
+    with pytest.raises(InvalidInputError, match=r"`init` is .*: This model has no touch encoder"):
         touch.start_from(model, Path(joint))
 
 
