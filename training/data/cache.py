@@ -25,7 +25,7 @@ def for_each(call: Callable[[int], object], data: RecordSet, quiet: bool = False
 
     They go in the order of their files, and neighbours to one thread, as a video is read forwards.
     """
-    order = sorted(range(len(data)), key=lambda row: natural(str(data[row].touch)))
+    order = sorted(range(len(data)), key=lambda row: natural(str(data.records[row].touch)))
     broken: dict[int, str] = {}
 
     def call_some(rows: list[int]) -> None:

@@ -16,7 +16,7 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
     same: dict[bytes, list[int]] = {}
 
     def read(row: int) -> None:
-        record = data[row]
+        record = data.records[row]
         for frame in filter(None, (record.picture, record.background)):
             frame.read()
         if record.sound:
@@ -32,8 +32,8 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
             lines.append(f"{shared} of {len(counts)} {what}s are in more than one of its own splits")
     twice = sorted(sorted(rows) for rows in same.values() if len(rows) > 1)
     odd = {
-        "records cannot be read": [f"{data[row].id}: {why}" for row, why in broken.items()],
-        "touches are there more than once": [" = ".join(data[row].id for row in rows) for rows in twice],
+        "records cannot be read": [f"{data.records[row].id}: {why}" for row, why in broken.items()],
+        "touches are there more than once": [" = ".join(data.records[row].id for row in rows) for rows in twice],
     }
     lines += [f"{len(names)} of {len(data)} {what}: {few(names)}" for what, names in odd.items() if names]
     return broken, lines

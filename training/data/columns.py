@@ -79,8 +79,7 @@ class Rendered:
         return len(self.material)
 
 
-FIELDS = {"image": "picture", "audio": "sound", "text": "caption"}
-"""Fields of a record by columns, where their names differ."""
+FIELDS = {"image": "picture", "audio": "sound", "text": "caption"}  # of a record, where columns have other names
 
 
 def has(record: Record, need: str) -> bool:
@@ -177,9 +176,10 @@ def decoded(
         rows = arrays["values"]
 
         def decode_row(row: int) -> None:
-            value = getattr(data[row], FIELDS.get(name, name))
+            record = data.records[row]
+            value = getattr(record, FIELDS.get(name, name))
             if name == "audio":
-                rows[row] = processor.sounds([sound_of(data[row], data)], name=value)[0, 0]
+                rows[row] = processor.sounds([sound_of(record, data)], name=value)[0, 0]
             else:
                 rows[row] = as_bytes(centre_rectangle(value.read(), *rows.shape[2:]))
 

@@ -59,9 +59,6 @@ class RecordSet:
     def __len__(self) -> int:
         return len(self.records)
 
-    def __getitem__(self, index: int) -> Record:
-        return self.records[index]
-
     @property
     def materials(self) -> tuple[str, ...]:
         """Names of the materials; none where it has no such label."""
@@ -151,14 +148,9 @@ def open_dataset(
         pairs = sorted({pair for one in records for pair in one.labels.items()}, key=lambda pair: natural(pair[1]))
         classes = {label: tuple(name for of, name in pairs if of == label) for label, _ in pairs}
         classes |= getattr(kinds[kind], "CLASSES", {})
-        numbered = tuple(
-            replace(
-                record,
-                sensor=sensor or record.sensor,
-                labels={label: classes[label].index(name) for label, name in record.labels.items()},
-            )
-            for record in records
-        )
+        for number, record in enumerate(records):
+            labels = {label: classes[label].index(name) for label, name in record.labels.items()}
+            records[number] = replace(record, sensor=sensor or record.sensor, labels=labels)
         if names is not None:  # by their numbers, where they are numbers
             numbers = [int(n) if n.isdecimal() else place for place, n in enumerate(classes.get("material", ()))]
             if max(numbers, default=-1) >= len(names):
@@ -167,7 +159,7 @@ def open_dataset(
         said = [of for of in ("object", "recording") if any(getattr(record, of) for record in records)]
         apart: Any = getattr(kinds[kind], "APART", said[0] if said else "none")
         notes = tuple(note for note in found if isinstance(note, str))
-        return RecordSet(place.name, kind, numbered, classes, apart, notes, sampling_rate)
+        return RecordSet(place.name, kind, tuple(records), classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         reason = f"its lists have no {error}" if isinstance(error, KeyError) else first_line(error)
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {reason}") from error

@@ -197,7 +197,7 @@ def test_a_layout_is_recognised_and_read(make: Callable, tmp_path: Path) -> None
     expected = [line.strip() for line in lines.strip().splitlines()]
     assert len(data) == count and [line for line in told(data) if line in expected] == expected
     captions = {table: "rough, and hard", ssvtp: "smooth, number 1", hct: "soft, 0"}
-    assert data[0].caption == captions.get(make)
+    assert data.records[0].caption == captions.get(make)
 
 
 def test_images_that_are_not_read_are_named(tmp_path: Path) -> None:
