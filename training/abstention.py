@@ -12,8 +12,7 @@ from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance,
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.world import ATTRIBUTES
 
-ABSTAINED = 0.046
-"""Share of the touches of training that are beyond the threshold."""
+ABSTAINED = 0.046  # share of the touches of training that are beyond the threshold
 
 
 def spread(values: np.ndarray, count: int = 500) -> np.ndarray:

@@ -13,8 +13,7 @@ from torch.distributed.nn.functional import all_gather
 
 from unitouch_gen.errors import InvalidInputError
 
-SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
-"""The bound of `denoising_losses`, in a recipe; .inf sets none."""
+SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]  # bound of `denoising_losses`; .inf sets none
 
 
 def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:

@@ -29,8 +29,7 @@ from unitouch_gen.world import ATTRIBUTES
 SHOWN = {"image": tuple(name for name in ATTRIBUTES if name not in ("depth", "load")), "touch": ATTRIBUTES}
 """Attributes that a modality shows: how hard a sensor is pressed leaves no trace in a picture."""
 
-MIRRORED = ("grain y", "place x")
-"""Attributes whose sign changes with left and right."""
+MIRRORED = ("grain y", "place x")  # attributes whose sign changes with left and right
 
 
 class ClassifierAugmentation(Settings):

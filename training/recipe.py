@@ -17,9 +17,7 @@ RECIPES = Path(__file__).parent / "recipes"
 
 Built = TypeVar("Built")
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Arguments = dict[str, Any]
-"""A section of arguments of a library's class; `build` checks them."""
+Arguments = dict[str, Any]  # a section of arguments of a library's class; `build` checks them
 
 
 class Settings(BaseModel):

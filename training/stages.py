@@ -51,8 +51,7 @@ STAGES: dict[str, dict[str, str]] = {
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
-NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}
-"""The same, with distillation, which is no part of a family and takes a saved pipeline."""
+NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
 
 
 class Recipe(Settings):

@@ -32,7 +32,7 @@ from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
 from unitouch_gen.files import read_settings, write_file
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.recipe import Seed, Settings, Share
+from unitouch_gen.training.recipe import Settings, Share
 
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 
@@ -57,7 +57,7 @@ class TrainerConfig(Settings):
     gradient_checkpointing: bool = False  # compute what blocks made once more on the way back, in place of keeping it
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
-    seed: Seed = 0  # of initial weights, batches and noise
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise
 
     @model_validator(mode="after")
     def _lasts_one_way(self) -> Self:

@@ -1,7 +1,4 @@
-"""Contacts of the world under sensors drawn anew, two for each contact, so that no sensor is worth knowing.
-
-Sixteen contacts share a pair of sensors, which see about as much of them. The first of a pair may be a sensor by name.
-"""
+"""Contacts of the world, each under two sensors that see about as much of it: drawn anew, or the first by name."""
 
 import hashlib
 import json
@@ -22,8 +19,7 @@ from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.gel import untouched_gel
 from unitouch_gen.world.sensors import draw_sensor
 
-GROUP = 16
-"""Contacts to a pair of sensors."""
+GROUP = 16  # contacts to a pair of sensors
 
 
 class Relit(World):
@@ -118,14 +114,14 @@ class DrawnContacts:
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
 
 
-SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", name, SENSORS))] | None
-"""A sensor of the world, or null for drawn ones."""
+SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", name, SENSORS))]
 
 
 class DrawnConfig(Settings):
     """What to render of the world."""
 
-    sensors: Annotated[list[SensorName], Field(min_length=1)] = [None]  # each with tokens of its own; null has none
+    # Each by name has tokens of its own; null is for drawn ones.
+    sensors: Annotated[list[SensorName | None], Field(min_length=1)] = [None]
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
     seed: NonNegativeInt = 0  # of the world

@@ -20,11 +20,8 @@ from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE, World
 from unitouch_gen.world.questions import TOPICS, asked_of
 
-FIRST_SEED = 1000
-"""Of the worlds that models are held against: beyond those that recipes train on."""
-
-OBJECTS, CONTACTS = 10, 5
-"""Objects of each material that probes are fitted to, and contacts of each object."""
+FIRST_SEED = 1000  # of the worlds that models are held against: beyond those that recipes train on
+OBJECTS, CONTACTS = 10, 5  # objects of each material that probes are fitted to, and contacts of each object
 
 
 def world_contacts(

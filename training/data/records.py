@@ -16,8 +16,7 @@ from unitouch_gen.files import files_below, is_hidden, natural
 from unitouch_gen.models.images import load_images
 from unitouch_gen.models.videos import read_video
 
-IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}
-"""Suffixes of files that Pillow reads as images."""
+IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}  # suffixes
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,7 @@ from unitouch_gen.files import read_table
 from unitouch_gen.training.data.records import Frame, Record, found, images_in
 
 LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
-SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
-"""Names of sensors by those of their folders."""
-
+SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}  # by their folders
 HEADER = ("item", *(f"{sensor}_{end}" for sensor in SENSORS for end in ("start", "end")))
 
 

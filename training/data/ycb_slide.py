@@ -12,9 +12,8 @@ from pathlib import Path
 
 from unitouch_gen.training.data.records import Frame, Record, found, frame_at, frames_in, images_in
 
-REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
-"""Also where one half of the data set is alone."""
-
+REAL = ("real/*/dataset_*", "*/dataset_*")  # the second where one half of the data set is alone
+SIMULATED = ("sim/*/*/tactile_images", "*/*/tactile_images")
 LOOKS_LIKE, APART = (*REAL, *SIMULATED), "recording"
 
 
