@@ -43,11 +43,11 @@ def _rows(values: np.ndarray | Tensor | Sequence[np.ndarray], index: np.ndarray)
     return torch.from_numpy(rows)
 
 
-# Indices of a step ----------------------------------------------------------------------------------------------------
+# Indices of a step, which follow from its number ----------------------------------------------------------------------
 
 
 class SamplerSettings(Settings):
-    """How `InBatchSampler` draws a batch of B."""
+    """How `in_batch_indices` draws a batch of B."""
 
     # Share from one data set (paper: 0.75). At 0 the whole batch is from the others, as the paper's formula says; null
     # chooses none: the batch is uniform over the union.
@@ -55,40 +55,28 @@ class SamplerSettings(Settings):
     group: PositiveInt = 1  # examples of the chosen one that are alike, the negatives that are hardest to tell apart
 
 
-class InBatchSampler:
+def in_batch_indices(
+    step: int, sizes: Sequence[int], batch_size: int, settings: SamplerSettings, seed: int = 0,
+    near: np.ndarray | None = None,
+) -> list[int]:  # fmt: skip
     """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others (Eq. 4).
 
-    Called with a step number it returns that step's indices into the concatenation of the data sets, of some `sizes`.
-    Groups are of an example and others of those nearest to it, by vectors `near` (N, D) of all examples.
+    Indices are into the concatenation of the data sets, of some `sizes`. Groups are of an example and others of those
+    nearest to it, by vectors `near` (N, D) of all examples.
     """
-
-    def __init__(
-        self, sizes: Sequence[int], batch_size: int, settings: SamplerSettings, seed: int = 0,
-        near: np.ndarray | None = None,
-    ):  # fmt: skip
-        self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
-        self.near, self.group = near, settings.group
-        self.share = share_of(settings.sigma, batch_size, len(sizes))
-
-    def __call__(self, step: int) -> list[int]:
-        rng, total = np.random.default_rng((self.seed, step)), int(self.sizes.sum())
-        if self.share is None:
-            return _draw(rng, total, self.batch_size).tolist()
-        chosen = int(rng.choice(len(self.sizes), p=self.sizes / total))
-        start, size = int(self.sizes[:chosen].sum()), int(self.sizes[chosen])
-        inside = start + self._inside(rng, start, size, self.share)
-        outside = _draw(rng, total - size, self.batch_size - self.share)
-        outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
-        return np.concatenate([inside, outside]).tolist()
-
-    def _inside(self, rng: np.random.Generator, start: int, size: int, count: int) -> np.ndarray:
-        pool = 4 * self.group  # nearest examples that a group is drawn from
-        if self.near is None or self.group == 1 or size <= pool:
-            return _draw(rng, size, count)
-        seeds, near = _draw(rng, size, -(-count // self.group)), self.near[start : start + size]
-        nearest = np.argsort(-(near[seeds] @ near.T), axis=1)[:, 1:pool]
-        others = [rng.choice(row, self.group - 1, replace=False) for row in nearest]
-        return np.concatenate([seeds[:, None], others], axis=1).reshape(-1)[:count]
+    rng, total = np.random.default_rng((seed, step)), int(sum(sizes))
+    count = share_of(settings.sigma, batch_size, len(sizes))
+    if count is None:
+        return _draw(rng, total, batch_size).tolist()
+    chosen = int(rng.choice(len(sizes), p=np.asarray(sizes) / total))
+    start, size = int(sum(sizes[:chosen])), int(sizes[chosen])
+    if near is None or settings.group == 1 or size <= 4 * settings.group:
+        inside = _draw(rng, size, count)
+    else:
+        inside = _draw_groups(rng, near[start : start + size], count, settings.group)
+    outside = _draw(rng, total - size, batch_size - count)
+    outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
+    return np.concatenate([start + inside, outside]).tolist()
 
 
 def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
@@ -99,24 +87,26 @@ def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
     return share
 
 
-class ShuffledSampler:
-    """Uniform batches without replacement within an epoch, as a function of the step alone."""
-
-    def __init__(self, size: int, batch_size: int, seed: int = 0):
-        if size < batch_size:
-            raise InvalidInputError(f"`batch_size` is {batch_size}, but there are {size} samples; take a smaller one.")
-        self.size, self.batch_size, self.seed = size, batch_size, seed
-
-    def __call__(self, step: int) -> list[int]:
-        per_epoch = self.size // self.batch_size
-        epoch, place = divmod(step, per_epoch)
-        order = np.random.default_rng((self.seed, epoch)).permutation(self.size)
-        return order[place * self.batch_size : (place + 1) * self.batch_size].tolist()
+def shuffled_indices(step: int, size: int, batch_size: int, seed: int = 0) -> list[int]:
+    """A uniform batch, without replacement within an epoch."""
+    if size < batch_size:
+        raise InvalidInputError(f"`batch_size` is {batch_size}, but there are {size} samples; take a smaller one.")
+    epoch, place = divmod(step, size // batch_size)
+    order = np.random.default_rng((seed, epoch)).permutation(size)
+    return order[place * batch_size : (place + 1) * batch_size].tolist()
 
 
 def _draw(rng: np.random.Generator, size: int, count: int) -> np.ndarray:
     """`count` of `size` indices, without repetition where that is possible."""
     return rng.choice(size, count, replace=count > size) if count else np.zeros(0, dtype=np.int64)
+
+
+def _draw_groups(rng: np.random.Generator, near: np.ndarray, count: int, group: int) -> np.ndarray:
+    """`count` rows of `near` (N, D), in groups of a row and others of the 4 `group` that are nearest to it."""
+    seeds = _draw(rng, len(near), -(-count // group))
+    nearest = np.argsort(-(near[seeds] @ near.T), axis=1)[:, 1 : 4 * group]
+    others = [rng.choice(row, group - 1, replace=False) for row in nearest]
+    return np.concatenate([seeds[:, None], others], axis=1).reshape(-1)[:count]
 
 
 # Augmentations of raw pixels (B, 3, S, S) in [0, 1], each with its own draw for every sample --------------------------

@@ -28,7 +28,7 @@ from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
-from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
@@ -52,6 +52,9 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 """Stages that may start from weights in place of random ones, by `--init`."""
 
 NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
+
+
+Indices = Callable[[int], Sequence[int]]  # those of a batch by the number of its step
 
 
 class Recipe(Settings):
@@ -97,6 +100,7 @@ class Stage:
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)
         self.trainer, self.data = self.recipe.trainer, self.recipe.data
+        self.batches = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
         folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
         needs = {*NEEDS[name]}
@@ -154,10 +158,10 @@ class Stage:
         """Embeddings (N, D) of all pictures, un-normalised, computed once."""
         return image_embeddings(model, [split.image for split in splits], self.key(splits), self.cache)
 
-    def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> InBatchSampler:
+    def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
-        sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
-        return InBatchSampler(sizes, self.trainer.batch_size, settings, self.trainer.seed, near)
+        given = {"sizes": [*map(len, splits)], "near": F.normalize(embeds.float(), dim=1).numpy()}
+        return partial(in_batch_indices, **self.batches, settings=settings, **given)
 
     def check_drawn(self, *weights: str) -> None:
         """Refuses data sets where the objective weighs what only drawn contacts have."""
@@ -165,13 +169,11 @@ class Stage:
             names = ", ".join(f"`objective.{name}`" for name in weights)
             raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
 
-    def fit(
-        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]] | None = None
-    ) -> None:
+    def fit(self, objective: nn.Module, dataset: ArrayDataset, indices_of: Indices | None = None) -> None:
         """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
-        indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
+        indices_of = indices_of or partial(shuffled_indices, size=len(dataset), **self.batches)
         begun = {"inputs": self.inputs, "recipe": self.given}
         trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun)
         if self.resume:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training import batches
 from unitouch_gen.training.audio import roll_in_time
-from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 
 
 def test_a_batch_is_a_copy_of_its_rows_of_every_column() -> None:
@@ -38,38 +39,36 @@ def sources(batch: list[int], sizes: np.ndarray = SIZES) -> np.ndarray:
 
 
 def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() -> None:
-    sampler = InBatchSampler(SIZES, 20, SIGMA, seed=3)
-    counts = np.stack([sources(sampler(step)) for step in range(1500)])
+    counts = np.stack([sources(in_batch_indices(step, SIZES, 20, SIGMA, seed=3)) for step in range(1500)])
     assert (counts.max(axis=1) == 15).all() and (counts.sum(axis=1) == 20).all()  # the rest is never of the chosen one
     chosen = np.eye(3, dtype=bool)[counts.argmax(axis=1)]
     assert chisquare(chosen.sum(axis=0), len(counts) * SIZES / SIZES.sum()).pvalue > 0.01
     others = np.where(chosen, 0, SIZES)
     expected = (5 * others / others.sum(axis=1, keepdims=True)).sum(axis=0)
     np.testing.assert_allclose(np.where(chosen, 0, counts).sum(axis=0), expected, rtol=0.05)
-    uniform = sum(sources(InBatchSampler(SIZES, 24, SamplerSettings(), seed=2)(step)) for step in range(500))
+    uniform = sum(sources(in_batch_indices(step, SIZES, 24, SamplerSettings(), seed=2)) for step in range(500))
     assert chisquare(uniform, uniform.sum() * SIZES / SIZES.sum()).pvalue > 0.01
 
 
 def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> None:
-    sampler = ShuffledSampler(103, 10)
-    epochs = [[index for place in range(10) for index in sampler(10 * epoch + place)] for epoch in range(5)]
+    batches = [[shuffled_indices(10 * epoch + place, 103, 10) for place in range(10)] for epoch in range(5)]
+    epochs = [[*itertools.chain(*epoch)] for epoch in batches]
     assert all(len({*epoch}) == len(epoch) == 100 for epoch in epochs) and epochs[0] != epochs[1]
     assert {index for epoch in epochs for index in epoch} == {*range(103)}
 
 
-@pytest.mark.parametrize("make", [lambda s: InBatchSampler(SIZES, 16, SIGMA, s), lambda s: ShuffledSampler(50, 8, s)])
-def test_a_batch_follows_from_the_number_of_its_step(make: Callable) -> None:
-    sampler = make(7)
-    later = [sampler(step) for step in (9, 3, 9)]
-    assert later[0] == later[2] == make(7)(9)
-    assert sampler(0) != sampler(1) and sampler(0) != make(8)(0)
+@pytest.mark.parametrize("indices_of", [partial(in_batch_indices, sizes=SIZES, batch_size=16, settings=SIGMA),
+                                        partial(shuffled_indices, size=50, batch_size=8)])  # fmt: skip
+def test_a_batch_follows_from_the_number_of_its_step_and_the_seed(indices_of: Callable) -> None:
+    assert indices_of(9, seed=7) == indices_of(9, seed=7)
+    assert indices_of(0, seed=7) != indices_of(1, seed=7) and indices_of(0, seed=7) != indices_of(0, seed=8)
 
 
 def test_batches_that_cannot_be_filled_are_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"`sampler\.sigma` is 0\.75, with no other data set"):
-        InBatchSampler([100], 16, SIGMA)
+        in_batch_indices(0, [100], 16, SIGMA)
     with pytest.raises(InvalidInputError, match="`batch_size` is 64, but there are 5 samples"):
-        ShuffledSampler(5, 64)
+        shuffled_indices(0, 5, 64)
 
 
 TIME, PERMUTED = torch.arange(12), [*itertools.permutations(range(3))]
@@ -127,8 +126,8 @@ def test_jitter_is_one_line_for_each_channel_and_noise_has_a_level_for_each_imag
 
 def test_groups_are_of_an_example_and_others_of_its_nearest() -> None:
     near = np.eye(10)[np.arange(600) // 60]  # ten kinds of sixty alike
-    sampler = InBatchSampler([600, 600], 16, SamplerSettings(sigma=0.5, group=4), 1, np.concatenate([near, near]))
-    rows = np.array(sampler(3))
-    assert len(set(rows[:8].tolist())) == 8 and sampler(3) == rows.tolist()
+    settings = SamplerSettings(sigma=0.5, group=4)
+    rows = np.array(in_batch_indices(3, [600, 600], 16, settings, seed=1, near=np.concatenate([near, near])))
+    assert len(set(rows[:8].tolist())) == 8
     for group in rows[:8].reshape(2, 4):
         assert len(set((group % 600 // 60).tolist())) == 1

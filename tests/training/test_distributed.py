@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 
@@ -37,7 +38,7 @@ def main(output: Path, resumed: bool) -> None:
     times = {"steps": 6, "warmup": 1, "save_every": 3, "keep_checkpoints": 2}
     config = TrainerConfig(**times, batch_size=8, learning_rate=0.05, ema_decay=0.5)
     objective = Matching()
-    trainer = Trainer(objective, data, ShuffledSampler(32, 8), config, output)
+    trainer = Trainer(objective, data, partial(shuffled_indices, size=32, batch_size=8), config, output)
     if resumed:
         trainer.resume()
         assert trainer.step == 3

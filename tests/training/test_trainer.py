@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoint_gradients, checkpoints_in, rate_at
 
 ROWS = 48
@@ -53,7 +54,8 @@ def data(broken_row: int | None = None) -> ArrayDataset:
 
 def make(output: Path, *, options: dict[str, Any] | None = None, **changes: Any) -> tuple[Trainer, Regression]:
     objective, config = Regression(**(options or {})), CONFIG.model_copy(update=changes)
-    return Trainer(objective, data(), ShuffledSampler(ROWS, config.batch_size, config.seed), config, output), objective
+    indices_of = partial(shuffled_indices, size=ROWS, batch_size=config.batch_size, seed=config.seed)
+    return Trainer(objective, data(), indices_of, config, output), objective
 
 
 def equal(first: list[Tensor], second: list[Tensor]) -> bool:
