@@ -100,7 +100,7 @@ class Stage:
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)
         self.trainer, self.data = self.recipe.trainer, self.recipe.data
-        self.batches = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
+        self.batches: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
         folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
         needs = {*NEEDS[name]}
@@ -160,8 +160,8 @@ class Stage:
 
     def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
-        given = {"sizes": [*map(len, splits)], "near": F.normalize(embeds.float(), dim=1).numpy()}
-        return partial(in_batch_indices, **self.batches, settings=settings, **given)
+        sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
+        return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)
 
     def check_drawn(self, *weights: str) -> None:
         """Refuses data sets where the objective weighs what only drawn contacts have."""
