@@ -9,7 +9,6 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
-from unitouch_gen.training.data import DrawnContacts, Rendered, Source
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
@@ -84,24 +82,13 @@ def recoloured(pictures: Tensor) -> Tensor:
     return batches.add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
 
 
-def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -> list[list[str]]:
-    """`count` captions of each sample; what is not drawn has one, again and again."""
-    captions = list[list[str]]()
-    for source, split in zip(sources, splits, strict=True):
-        if isinstance(source, DrawnContacts):
-            captions += source.captions("train", count)
-        else:
-            captions += [[caption] * count for caption in split.text]
-    return captions
-
-
 def main(stage: Stage) -> None:
     recipe: ImageTextRecipe = stage.recipe
     init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
     build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
-    captions = captions_of(stage.sources, splits, objective.captions)
+    captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
     texts = [caption for one in captions for caption in one]
     if init is not None:
         model = UniTouchModel.from_pretrained(init, modalities=("image", "text"), dtype=torch.float32)

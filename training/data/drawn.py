@@ -91,9 +91,9 @@ class DrawnContacts:
         pairs = [self.pair(split, group) for group in groups]
         return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
 
-    def captions(self, split: str, variants: int) -> list[list[str]]:
-        """As many captions of each contact of a split as asked for, the first of them that of its scene."""
-        draws = World(self.seed).draw(*self.contacts(split))
+    def captions(self, variants: int) -> list[list[str]]:
+        """As many captions of each contact to train on as asked for, the first of them that of its scene."""
+        draws = World(self.seed).draw(*self.contacts("train"))
         return [list(texts) for texts in zip(*(described(draws, one) for one in range(variants)), strict=True)]
 
     def fingerprint(self, split: str) -> str:

@@ -74,6 +74,10 @@ class RecordSet:
         """What a training run keeps on record of it."""
         return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}
 
+    def captions(self, variants: int) -> list[list[str]]:
+        """The caption of each record, as many times as asked for."""
+        return [[record.caption or ""] * variants for record in self.records]
+
     def by_sensor(self) -> "list[RecordSet]":
         """A part for each sensor, in the order of their first records."""
         sensors = dict.fromkeys(record.sensor for record in self.records)

@@ -11,7 +11,6 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, DrawnConfig, Rendered, columns_of, sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
-from unitouch_gen.training.image_text import captions_of
 from unitouch_gen.world import SAMPLE_RATE, SENSORS, World, contact_maps
 
 CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1))
@@ -50,7 +49,7 @@ def test_what_is_rendered_is_the_worlds(splits: list[Rendered], processor: UniTo
 
 
 def test_every_contact_has_captions_of_its_own(splits: list[Rendered]) -> None:
-    told = captions_of(SOURCES, splits, 3)
+    told = [texts for source in SOURCES for texts in source.captions(3)]
     assert [captions[0] for captions in told] == [caption for split in splits for caption in split.text]
     assert all(len(captions) == 3 for captions in told)
     assert sum(len(set(captions)) for captions in told[:34]) > 2.5 * 34
