@@ -110,25 +110,22 @@ def inputs(
     def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
         return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
 
-    columns = {
-        "latents": latents_of("touch", [split.touch for split in splits]),
-        "image_embeds": embeds,
-        "sensor": torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors))),
-    }
+    latents = latents_of("touch", [split.touch for split in splits])
+    sensor = torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors)))
     if not with_gels:
-        return ArrayDataset(**columns), None
+        return ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor), None
     drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
     gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in drawn)  # (2 G, 3, S, S)
-    columns["background"] = torch.from_numpy(np.concatenate(places_of(splits)))
+    places = torch.from_numpy(np.concatenate(places_of(splits)))
     # Each contact is learnt by its second sensor as well, which has no name.
-    others = {
-        "latents": latents_of("second", [split.second for split in splits if split.second is not None]),
-        "image_embeds": embeds,
-        "sensor": torch.full_like(columns["sensor"], len(sensors)),
-        "background": columns["background"] + 1,
-    }
-    columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
-    return ArrayDataset(**columns), latents_of("untouched", gels)
+    seconds = latents_of("second", [split.second for split in splits if split.second is not None])
+    dataset = ArrayDataset(
+        latents=torch.cat([latents, seconds]),
+        image_embeds=torch.cat([embeds, embeds]),
+        sensor=torch.cat([sensor, torch.full_like(sensor, len(sensors))]),
+        background=torch.cat([places, places + 1]),
+    )
+    return dataset, latents_of("untouched", gels)
 
 
 def main(stage: Stage) -> None:
@@ -144,10 +141,8 @@ def main(stage: Stage) -> None:
     unet = stage.unet(recipe.model, num_class_embeds=classes)
     wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
     if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
-        raise InvalidInputError(
-            f"The network has {wrong}; for latents of `vae` and the sensors of `data` it takes {wanted}. Change "
-            "`model`, or name another `init`."
-        )
+        takes = f"for latents of `vae` and the sensors of `data` it takes {wanted}"
+        raise InvalidInputError(f"The network has {wrong}; {takes}. Change `model`, or name another `init`.")
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
 
     dataset, table = inputs(stage, joint, vae, sensors, with_gels)
