@@ -11,14 +11,14 @@ the same number where there are no times.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_text
-from unitouch_gen.training.data.records import Frame, Record, few
+from unitouch_gen.training.data.records import Frame, Record, few, found
 
 LOOKS_LIKE = ("dataset/[0-9]*_[0-9]*",)
 MATERIALS = (
@@ -36,7 +36,8 @@ def read(folder: Path) -> Iterator[Record | str]:
     if both := sorted(train.keys() & test.keys()):
         raise InvalidInputError(f"train.txt and test.txt both list {few(both)}.")
     labels = every | train | test
-    recordings = {name: Recording(folder / "dataset" / name) for name in {frame.split("/")[0] for frame in labels}}
+    clocks = {name: found(folder / "dataset" / name, "time[12].npy") for name in {one.split("/")[0] for one in labels}}
+    times = {name: [np.load(file, allow_pickle=False) for file in files] for name, files in clocks.items()}
     for frame, material in labels.items():
         if material < 0:
             continue
@@ -44,30 +45,21 @@ def read(folder: Path) -> Iterator[Record | str]:
         numbers = {"material": material, "soft": int(material in SOFT), "rough": rough.get(frame, -1)}
         names = {label: CLASSES[label][number] for label, number in numbers.items() if number >= 0}
         split = "train" if frame in train else "test" if frame in test else None
-        touch, picture = recordings[name].frames(file)
+        touch, picture = frames_of(folder / "dataset" / name, file, times[name])
         yield Record(frame, touch, picture, sensor="gelsight", recording=name, labels=names, split=split)
     if skipped := sum(material < 0 for material in labels.values()):
         yield f"{skipped} frames whose material is inconclusive (-1) are left out"
 
 
-class Recording:
-    """Where the frames of one recording are."""
-
-    def __init__(self, folder: Path):
-        self.folder, self.images = folder, (folder / "gelsight_frame").is_dir()
-        times = [folder / "time1.npy", folder / "time2.npy"]
-        self.times = [np.load(file, allow_pickle=False) for file in times if file.is_file() and not self.images]
-
-    def frames(self, name: str) -> tuple[Frame, Frame]:
-        """The touch and the picture of a frame by its name in the lists."""
-        if self.images:
-            return Frame(str(self.folder / "gelsight_frame" / name)), Frame(str(self.folder / "video_frame" / name))
-        number = nearest = int(Path(name).stem)
-        if len(self.times) == 2:
-            camera, gel = self.times
-            nearest = int(np.abs(camera - gel[number]).argmin())
-        gelsight, video = str(self.folder / "gelsight.mp4"), str(self.folder / "video.mp4")
-        return Frame(gelsight, index=number), Frame(video, index=nearest)
+def frames_of(recording: Path, name: str, times: Sequence[np.ndarray]) -> tuple[Frame, Frame]:
+    """The touch and the picture of a frame by its name in the lists; `times` are the camera's and the GelSight's."""
+    touch, picture = recording / "gelsight_frame" / name, recording / "video_frame" / name
+    if touch.parent.is_dir():
+        return Frame(str(touch)), Frame(str(picture))
+    number = nearest = int(touch.stem)
+    if len(times) == 2:
+        nearest = int(np.abs(times[0] - times[1][number]).argmin())
+    return Frame(str(recording / "gelsight.mp4"), index=number), Frame(str(recording / "video.mp4"), index=nearest)
 
 
 def read_list(file: Path) -> dict[str, int]:
