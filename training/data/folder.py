@@ -26,17 +26,16 @@ SPLITS = ("train", "val", "test")
 
 
 def read(folder: Path) -> Iterator[Record | str]:
-    """What its table names, or the images in it; and which images are left out."""
+    """What its table names, or the images in it; and which files are left out."""
     tables = [file for file in found(folder, "*") if file.suffix.lower() in (".csv", ".tsv")]
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     records = list(read_rows(folder, tables[0]) if tables else read_tree(folder))
     yield from records
-    used = set[str]().union(*(record.files for record in records))
-    images = [] if tables else [image for image in images_in(folder, "**/*") if str(image) not in used]
-    if images:
-        names = few([image.relative_to(folder).as_posix() for image in images])
-        yield f"{len(images)} images are not read, as no touch in `touch` has their names: {names}"
+    used = set(map(str, tables)).union(*(record.files for record in records))
+    unread = [file.relative_to(folder).as_posix() for file in found(folder, "**/*") if str(file) not in used]
+    if unread:
+        yield f"{len(unread)} other files are not read, as they belong to no touch: {few(unread)}"
 
 
 def read_rows(folder: Path, table: Path) -> Iterator[Record]:

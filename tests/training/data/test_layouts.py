@@ -200,10 +200,12 @@ def test_a_layout_is_recognised_and_read(make: Callable, tmp_path: Path) -> None
     assert data.records[0].caption == captions.get(make)
 
 
-def test_images_that_are_not_read_are_named(tmp_path: Path) -> None:
-    tree(tmp_path)
-    write(tmp_path, {"photos/1.png": 5})
-    assert open_dataset(tmp_path).notes[0].endswith("in `touch` has their names: photos/1.png")
+@pytest.mark.parametrize("make", [table, tree])
+def test_files_that_are_not_read_are_named(make: Callable, tmp_path: Path) -> None:
+    make(tmp_path)
+    write(tmp_path, {"photos/1.png": 5, "photos/2.heic": "", "photos/.hidden.png": 5})
+    expected = "2 other files are not read, as they belong to no touch: photos/1.png; photos/2.heic"
+    assert expected in open_dataset(tmp_path).notes
 
 
 def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
