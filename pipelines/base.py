@@ -46,7 +46,7 @@ from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
-from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
+from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
 from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
 
 Generators = torch.Generator | list[torch.Generator] | None
@@ -68,10 +68,7 @@ def runs_networks(method: Method) -> Method:
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        weights = list(getattr(self, self._main_network).parameters())
-        if any(one.is_meta for one in weights):
-            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
-        small = sum(one.numel() for one in weights) < SMALL_NETWORK
+        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < SMALL_NETWORK
         _threads.append([*_threads, torch.get_num_threads()][0])
         torch.set_num_threads(1 if small else _threads[0])
         try:
@@ -130,7 +127,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _task = "image-to-image"  # and its tag
     text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
     embedding_bank: Any = None  # touch-to-text has none
-    _card: Card | Path | None = None  # or the folder with the card
+    _card = Card()
 
     def _finish_init(self, network: str, **defaults: float) -> None:
         """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
@@ -403,7 +400,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 if part not in kwargs:
                     check_filled(folder / part, getattr(pipe, part, None))
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
-        pipe._card = folder if (folder / CARD).is_file() else None
         return pipe
 
     @classmethod
@@ -419,36 +415,28 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
-        LoRA weights are left out, but for fused ones. Also writes two-line Python files, by which
-        `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)` finds our classes, and a model card,
-        README.md. Without `card`, an existing card stays; else that which the pipeline was loaded with is written.
+        Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
+        finds our classes, and a model card, README.md. Without `card`, an existing card stays.
 
         Raises:
-            InvalidInputError: If the folder cannot be written to; what it held stays as it was.
+            InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
         """
-        if card is not None:
-            check_kind("card", card, Card)
+        check_kind("card", card, Card, type(None))
         folder = as_path("save_directory", save_directory)
-        upload = kwargs.pop("push_to_hub", False)
-        plain = copy.copy(self)
-        for name, part in without_lora(self.components).items():
-            setattr(plain, name, part)
+        upload, name = kwargs.pop("push_to_hub", False), kwargs.pop("repo_id", folder.resolve().name)
+        networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
+        if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
+            raise InvalidInputError(
+                "LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`."
+            )
         with writing_folder("save_directory", folder) as place:
-            super(UniTouchPipeline, plain).save_pretrained(place, *args, **kwargs)
+            super().save_pretrained(place, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
                 name_classes(place)
             if card is not None or not (folder / CARD).exists():
-                self._write_card(place, folder.resolve().name, card)
+                (card or self._card).write(place, name, self)
         if upload:
-            self.push_to_hub(kwargs.pop("repo_id", folder.resolve().name), card=card, **kwargs)
-
-    def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
-        """Writes the given card, the pipeline's own, or a default one, whose example loads `name`."""
-        known = card or self._card or Card()
-        if isinstance(known, Path):
-            copy_card(known, folder)
-        else:
-            known.write(folder, name, self)
+            self.push_to_hub(name, card=card, **kwargs)
 
     def push_to_hub(self, repo_id: str, *, card: Card | None = None, **kwargs: Any) -> Any:  # type: ignore[override]
         """Uploads what `save_pretrained` writes, with the model card; `kwargs` as of diffusers' `push_to_hub`."""
@@ -456,8 +444,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         private = kwargs.pop("private", None)
         repo_id = create_repo(repo_id, private=private, token=options["token"], exist_ok=True).repo_id
         with tempfile.TemporaryDirectory() as place:
-            self.save_pretrained(place, **kwargs)
-            self._write_card(Path(place), repo_id, card)
+            self.save_pretrained(place, card=card, repo_id=repo_id, **kwargs)  # the card names it
             return self._upload_folder(place, repo_id, **options)
 
     def load_lora_weights(self, pretrained_model_name_or_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
@@ -469,20 +456,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
         with nullcontext() if isinstance(place, dict) else reading(name, place):
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
-
-
-def without_lora(components: dict[str, Any]) -> dict[str, Any]:
-    """Networks that have LoRA layers without these: copies that share all weights, fused ones too."""
-    networks = {name: part for name, part in components.items() if isinstance(part, torch.nn.Module)}
-    shared = {id(one): one for part in networks.values() for one in [*part.parameters(), *part.buffers()]}
-    wrapped = {name for name, part in networks.items() if any(hasattr(one, "base_layer") for one in part.modules())}
-    plain = {name: copy.deepcopy(networks[name], shared) for name in wrapped}
-    for network in plain.values():
-        network._hf_peft_config_loaded = False  # type: ignore[assignment]  # or transformers writes LoRA weights alone
-        for module in list(network.modules()):
-            for key, child in module.named_children():
-                setattr(module, key, getattr(child, "base_layer", child))
-    return plain
 
 
 def check_filled(folder: Path, network: Any) -> None:

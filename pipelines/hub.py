@@ -154,10 +154,3 @@ is `pipeline.py`, which imports `unitouch_gen`.
 
 {license}
 """
-
-
-def copy_card(source: Path, folder: Path) -> None:
-    """Copies the model card of another folder, with its pictures."""
-    shutil.copyfile(source / CARD, folder / CARD)
-    if (source / PICTURES).is_dir():
-        shutil.copytree(source / PICTURES, folder / PICTURES, dirs_exist_ok=True)
