@@ -20,7 +20,7 @@ from transformers import CLIPTokenizer
 
 from tests.helpers.imagebind import ImageBind
 from tests.helpers.published_files import features_of, inputs_of, published, small
-from unitouch_gen.convert import convert_published, open_checkpoint, read_config, read_published
+from unitouch_gen.convert import convert_published, open_checkpoint, read_published
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
@@ -243,11 +243,3 @@ def test_what_else_is_there_is_not_written_over(files, folder, tmp_path, content
     with pytest.raises(InvalidInputError, match="`output`"):
         convert_published(output, touch=files["touch"], config=small())
     assert contents(tmp_path) == before
-
-
-def test_sizes_are_read_of_a_config(folder, tmp_path):
-    found = read_config("--config", folder / "config.json").touch_config
-    assert found.to_diff_dict() == small().touch_config.to_diff_dict()
-    (tmp_path / "config.json").write_text('{"model_type": "clip"}')
-    with pytest.raises(InvalidInputError, match=r"`--config` names .*describes no joint space"):
-        read_config("--config", tmp_path / "config.json")

@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, first_line
-from unitouch_gen.files import as_path, check_file, read_settings, writing_folder
+from unitouch_gen.files import as_path, check_file, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
@@ -233,14 +233,6 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     if not tensors:
         raise InvalidInputError(f"{subject} holds no weights; pass a state dict.")
     return tensors
-
-
-def read_config(name: str, file: Path) -> UniTouchConfig:
-    """Sizes of a joint space, from its config.json, which the user passed as the argument `name`."""
-    settings = read_settings(name, file)
-    if settings.get("model_type") != UniTouchConfig.model_type:
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which describes no joint space; pass its config.json.")
-    return UniTouchConfig.from_dict(settings)
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

@@ -23,12 +23,14 @@ def unitouch(
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
-    from unitouch_gen.convert import convert_published, read_config
+    from unitouch_gen.convert import convert_published
     from unitouch_gen.errors import InvalidInputError, check_dtype
+    from unitouch_gen.files import read_settings
+    from unitouch_gen.models import UniTouchConfig
 
     if touch is None and imagebind is None:
         raise InvalidInputError("Nothing was given to convert; pass `--touch`, `--imagebind` or both.")
-    sizes = None if config is None else read_config("--config", config)
+    sizes = None if config is None else UniTouchConfig.from_dict(read_settings("--config", config))
     kind = None if dtype is None else check_dtype("--dtype", dtype)
     lacks = convert_published(output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind)
     if lacks:
