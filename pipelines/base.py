@@ -15,9 +15,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import diffusers
 import torch
-from diffusers import DDIMScheduler, DiffusionPipeline, SchedulerMixin
+from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
@@ -98,12 +97,6 @@ class CallSettings:
     output_type: str
     throw: bool
 
-    def __post_init__(self) -> None:
-        check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
-        check_kind("throw", self.throw, bool)
-        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs, dict, type(None)) or {}
-        check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
-
 
 @dataclass(frozen=True)
 class Touches:
@@ -161,20 +154,31 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """The argument, or the checkpoint's default if `None`."""
         return self.config[f"default_{name}"] if value is None else value
 
-    def _check_steps(
-        self, num_inference_steps: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any,
-        init_strength: float = 1.0,
-    ) -> Steps:  # fmt: skip
-        """Validated steps, by default the checkpoint's number; see `prepare_steps`."""
+    def _check_call(
+        self, inputs: int, num_images_per_prompt: Any, height: Any, width: Any, num_inference_steps: Any,
+        guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any, generator: Any, latents: Any,
+        output_type: Any, cross_attention_kwargs: Any, callback: Any, callback_inputs: Any, throw: Any,
+        init_strength: Any = 1.0,
+    ) -> CallSettings:  # fmt: skip
+        """The validated arguments of a call with `inputs` inputs; `None` is the checkpoint's default."""
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
+        check_choice("output_type", output_type, ("pil", "np", "pt", "latent"))
+        check_kind("throw", throw, bool)
+        lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
+        check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
+        scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_SCALE)
         if tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        return prepare_steps(
+        steps = prepare_steps(
             self.scheduler, num_inference_steps=num_inference_steps, solver=solver, tolerance=tolerance,
             max_evaluations=max_evaluations, eta=eta, init_strength=init_strength, device=self._execution_device,
         )  # fmt: skip
-
-    def _check_guidance(self, scale: float | None) -> Guidance:
-        return Guidance(check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_SCALE))
+        return CallSettings(
+            shape=self._check_shape(inputs * repeats, height, width, generator, latents), repeats=repeats,
+            device=self._execution_device, steps=steps, guidance=Guidance(scale), generator=generator, latents=latents,
+            callback=callback, callback_inputs=self._check_callback(callback, callback_inputs, tolerance),
+            cross_attention_kwargs=cross_attention_kwargs, output_type=output_type, throw=throw,
+        )  # fmt: skip
 
     def _check_shape(
         self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
@@ -426,9 +430,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         upload, name = kwargs.pop("push_to_hub", False), kwargs.pop("repo_id", folder.resolve().name)
         networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
         if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
-            raise InvalidInputError(
-                "LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`."
-            )
+            raise InvalidInputError("LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`.")
         with writing_folder("save_directory", folder) as place:
             super().save_pretrained(place, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
@@ -476,15 +478,6 @@ def check_filled(folder: Path, network: Any) -> None:
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."
         )
-
-
-def read_scheduler(folder: Path) -> SchedulerMixin:
-    """The scheduler of a checkpoint, of the class of diffusers that its config names."""
-    name = DDIMScheduler.load_config(folder)["_class_name"]
-    kind = getattr(diffusers, name, None)
-    if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
-        raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return getattr(diffusers, name).from_pretrained(folder)
 
 
 def check_unused(instead: str, **given: Any) -> None:

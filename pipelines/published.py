@@ -11,44 +11,34 @@ from diffusers import StableUnCLIPImg2ImgPipeline
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPVisionModelWithProjection
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
-from unitouch_gen.files import NEVER_READ, local_folder, read_settings, reading
+from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.files import NEVER_READ, local_folder, reading
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.base import check_filled
 
-SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options of both; `revision` is of the unCLIP
-
 
 def read_joint(
-    unitouch: str | os.PathLike | UniTouchModel, dtype: torch.dtype, hub: dict[str, Any]
+    unitouch: str | os.PathLike | UniTouchModel, dtype: torch.dtype, **hub: Any
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
     """A converted joint space and its processor; no encoder is read yet."""
-    for name in hub:
-        check_choice("from_published", name, [*SHARED_OPTIONS, "revision"], hint="These are download options.")
     if isinstance(unitouch, UniTouchModel):
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
-    folder = local_folder("unitouch", unitouch, **{name: hub[name] for name in SHARED_OPTIONS if name in hub})
+    folder = local_folder("unitouch", unitouch, **hub)
     check_holds("unitouch", folder, ["config.json"], "a joint space that `unitouch-gen convert unitouch` wrote")
     dtype = check_dtype("dtype", dtype)
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
 def read_unclip(
-    unclip: str | os.PathLike, model: UniTouchModel, dtype: torch.dtype, variant: str | None, hub: dict[str, Any]
+    unclip: str | os.PathLike, model: UniTouchModel, dtype: torch.dtype, variant: str | None, **hub: Any
 ) -> StableUnCLIPImg2ImgPipeline:
     """An unCLIP pipeline; a joint space without image encoder gets the pipeline's."""
     own = "image" in model.known_modalities
     unread = [*NEVER_READ, *([] if variant else ["*.fp16.*"]), *(["image_encoder/*"] if own else [])]
-    folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **hub})
+    folder = local_folder("unclip", unclip, ignore_patterns=unread, **hub)
     parts = ["image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae"]
     check_holds("unclip", folder, parts, "a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP")
-    width = read_settings("unclip", folder / "image_normalizer" / "config.json").get("embedding_dim")
-    if width != model.config.projection_dim:
-        raise InvalidInputError(
-            f"`unitouch` has embeddings of width {model.config.projection_dim}, `unclip` of width {width}; use models "
-            "of one width."
-        )
     files: dict[str, Any] = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
     with reading("unclip", folder):
         pipe = StableUnCLIPImg2ImgPipeline.from_pretrained(folder, **files, feature_extractor=None, image_encoder=None)

@@ -12,9 +12,7 @@ from unitouch_gen.conditioning import mix_linear, mix_to_norm
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
-    MAX_IMAGES,
     MAX_SCALE,
-    CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
@@ -127,15 +125,16 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         # 1. Check inputs, before any network runs
         strength = check_number("strength", strength, 0.0, MAX_SCALE)
         check_choice("mix", mix, MIXES)
-        check_number("init_strength", init_strength, 0.0, 1.0)
         check_kind("keep_colours", keep_colours, bool)
         hold = None
         if layout is not None:
             hold = LayoutHold(self.scheduler, check_integer("layout", layout, 2), keep_colours)
         if touch_weight is None:
             touch_weight = 0.3 if layout is None else 0.7
+        if image_weight is None:
+            image_weight = 1.0 - check_number("touch_weight", touch_weight, 0.0, 1.0)
+        weights = check_weights("touch_weight, image_weight", [touch_weight, image_weight])
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
-        weights = self._check_mixture(touch_weight, image_weight)
         for name, value in (("image", image), ("touch", touch)):
             if value is None:
                 raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
@@ -144,16 +143,10 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         if min(sizes) not in (1, max(sizes)):
             raise InvalidInputError(f"`image` holds {sizes[0]} photos and `touch` {sizes[1]}; pass one, or one each.")
         batch_size = max(sizes)
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
-        settings = CallSettings(
-            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(
-                num_inference_steps, solver, tolerance, max_evaluations, eta, init_strength
-            ),
-            guidance=self._check_guidance(guidance_scale),
-            callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
-            callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
-            device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
+        settings = self._check_call(
+            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw, init_strength,
         )  # fmt: skip
         positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
         prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
@@ -193,11 +186,3 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             report.left_out.append("image encoder")
         stacked = torch.stack([part.expand(batch_size, -1) for part in parts])
         return strength * MIXES[mix](stacked, torch.tensor(shares).to(stacked))
-
-    def _check_mixture(self, touch_weight: float, image_weight: float | None) -> list[float]:
-        """Weights of touches and photos, which sum to 1; that of photos defaults to the rest."""
-        touch_weight = check_number("touch_weight", touch_weight, 0.0, MAX_SCALE)
-        if image_weight is None and touch_weight > 1.0:
-            raise InvalidInputError(f"`touch_weight` is {touch_weight:g}; above 1, pass `image_weight`, too.")
-        image_weight = 1.0 - touch_weight if image_weight is None else image_weight
-        return check_weights("touch_weight, image_weight", [touch_weight, image_weight])

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import diffusers
 import torch
 from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
@@ -14,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, ne
 from unitouch_gen.files import as_path, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import stored_class
-from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled, read_scheduler
+from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
@@ -85,7 +86,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
             parts["vae"] = stored(stored_class(vae), vae)
             parts["unet"] = stored(UNet2DConditionModel, folder / "unet")
-            parts["scheduler"] = read_scheduler(folder / "scheduler")
+            scheduler = read_settings("family", folder / "scheduler" / "scheduler_config.json")["_class_name"]
+            parts["scheduler"] = getattr(diffusers, scheduler).from_pretrained(folder / "scheduler")
         if kind is XToTouchPipeline and (folder / "backgrounds").is_dir():
             parts["backgrounds"] = stored(SensorBackgrounds, folder / "backgrounds")
         if kind in (TouchToImagePipeline, TactileStylizationPipeline):

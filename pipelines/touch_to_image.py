@@ -1,7 +1,6 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
@@ -23,7 +22,6 @@ from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
-    check_choice,
     check_integer,
     check_kind,
     check_number,
@@ -34,7 +32,6 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.base import (
-    MAX_IMAGES,
     MAX_SCALE,
     CallSettings,
     Generators,
@@ -183,19 +180,15 @@ class TouchToImagePipeline(UniTouchPipeline):
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
         touches = None if touch is None else self._prepare_touch(touch, sensor, background)
-        batch_size = len(embeds if touches is None else touches.pixels)
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
-        settings = CallSettings(
-            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(num_inference_steps, solver, tolerance, max_evaluations, eta),
-            guidance=self._check_guidance(guidance_scale),
-            callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
-            callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
-            device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
+        inputs = len(embeds if touches is None else touches.pixels)
+        settings = self._check_call(
+            inputs, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw,
         )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
         positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
+        prompts = self._check_prompts(inputs, settings.guidance, positive, negative)
 
         # 2. Encode the touch
         report = RunReport()
@@ -347,12 +340,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
         modules, settings = cls._get_signature_keys(cls)
-        for name in kwargs:
-            check_choice("from_pipe", name, [*modules, *settings])
-        available = {**pipeline.config, **pipeline.components, **kwargs}
-        parts = {name: available[name] for name in (*modules, *settings) if name in available}
-        if missing := sorted({*modules} - {*cls._optional_components, *parts}):
-            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
+        available = {**pipeline.config, **pipeline.components}
+        parts = {name: available[name] for name in (*modules, *settings) if name in available} | kwargs
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
         return cls(**parts)
@@ -375,20 +364,20 @@ class TouchToImagePipeline(UniTouchPipeline):
     @classmethod
     def from_published(
         cls, unclip: str | os.PathLike, unitouch: str | os.PathLike | UniTouchModel, *,
-        embedding_norm: float | None = None, dtype: torch.dtype = torch.float32, variant: str | None = None,
-        **hub: Any,
+        dtype: torch.dtype = torch.float32, variant: str | None = None, revision: str | None = None,
+        cache_dir: str | os.PathLike | None = None, token: str | bool | None = None, local_files_only: bool = False,
     ) -> Self:  # fmt: skip
         """Builds on published weights: an unCLIP model and a converted joint space.
+
+        Touches are rescaled to the norm of image embeddings that the unCLIP's normaliser tells of.
 
         Args:
             unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
                 image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
-            embedding_norm: Norm of image embeddings, set in the joint space; touches are rescaled to it. Default: that
-                of the unCLIP's normaliser.
             dtype: dtype of the networks.
-            variant: Variant of the unCLIP's files, such as "fp16".
-            hub: Download options: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
+            variant, revision: Of the unCLIP's files, such as "fp16".
+            cache_dir, token, local_files_only: Of downloads, as in `from_pretrained`.
 
         Raises:
             InvalidInputError: If a model cannot be read, or their embeddings differ in width.
@@ -396,10 +385,10 @@ class TouchToImagePipeline(UniTouchPipeline):
         Example:
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
         """
-        model, processor = read_joint(unitouch, dtype, hub)
-        source = read_unclip(unclip, model, dtype, variant, hub)
+        hub: Any = {"cache_dir": cache_dir, "token": token, "local_files_only": local_files_only}
+        model, processor = read_joint(unitouch, dtype, **hub)
+        source = read_unclip(unclip, model, dtype, variant, revision=revision, **hub)
         if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
             processor.tokenizer = source.tokenizer
-        norm = expected_norm(source.image_normalizer) if embedding_norm is None else embedding_norm
-        model.config.embedding_norm = check_number("embedding_norm", norm, sys.float_info.min)
+        model.config.embedding_norm = expected_norm(source.image_normalizer)
         return cls.from_pipe(source, unitouch=model, processor=processor)

@@ -210,7 +210,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         """Builds on Touch-LLM's published `bridge` and a `llama`, see `read_touch_llm`, and a converted joint space."""
         parts = read_touch_llm(bridge, llama, dtype=dtype)
         if unitouch is not None:
-            parts["unitouch"], parts["processor"] = read_joint(unitouch, dtype, {})
+            parts["unitouch"], parts["processor"] = read_joint(unitouch, dtype)
         return cls(**parts)
 
 

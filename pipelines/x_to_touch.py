@@ -13,7 +13,6 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_no
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
-    check_integer,
     check_kind,
     check_tensor,
     check_texts,
@@ -24,7 +23,6 @@ from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import (
-    MAX_IMAGES,
     CallSettings,
     Generators,
     SensorNames,
@@ -88,18 +86,14 @@ class XToTouchPipeline(UniTouchPipeline):
             "`unet`", default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
         )  # fmt: skip
-        self._check_parts()
-
-    def _check_parts(self) -> None:
-        """Raises if class labels, sensors and stored backgrounds do not fit each other."""
-        config, sensors = self.unet.config, self.config.sensors
+        config = unet.config
         if config.class_embed_type is not None:
             raise InvalidInputError(f"`unet` takes class labels of the kind {config.class_embed_type!r}, as unCLIP's.")
         others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
         labels = config.num_class_embeds or 0
         if labels != len(sensors) + others:
             raise InvalidInputError(f"`sensors` names {len(sensors)}, but `unet` has {labels - others} to be named.")
-        if others and (self.backgrounds is None or self.backgrounds.config["count"] != len(sensors)):
+        if others and (backgrounds is None or backgrounds.config["count"] != len(sensors)):
             raise InvalidInputError("`backgrounds` of each of `sensors` is missing, which `unet` takes.")
 
     @property
@@ -199,14 +193,10 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs = len(embeds)
         gels, sensor_labels = self._check_sensor(sensor, background, inputs)
         batch_size = len(sensor_labels)
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
-        settings = CallSettings(
-            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            steps=self._check_steps(num_inference_steps, solver, tolerance, max_evaluations, eta),
-            guidance=self._check_guidance(guidance_scale),
-            callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
-            callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
-            device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
+        settings = self._check_call(
+            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw,
         )  # fmt: skip
 
         # 2. Encode the condition
@@ -216,8 +206,8 @@ class XToTouchPipeline(UniTouchPipeline):
             with report.stage("condition"):
                 embeds = self._condition(conditions, bool(bridge), report, throw)
         embeds = embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden_states = embeds.repeat_interleave(repeats, dim=0)
-        labels = torch.tensor(sensor_labels).repeat_interleave(repeats) if self.config.sensors else None
+        hidden_states = embeds.repeat_interleave(settings.repeats, dim=0)
+        labels = torch.tensor(sensor_labels).repeat_interleave(settings.repeats) if self.config.sensors else None
         extra_channels = self._background_latents(gels, labels, settings) if self.takes_background else None
         if settings.guidance.active:  # the unconditional token is zeros
             hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])

@@ -159,8 +159,12 @@ def test_parts_and_settings_that_do_not_fit_are_refused_by_name(pipe, components
         "embedding_bank": lambda: TouchToImagePipeline(**{**components, "embedding_bank": EmbeddingBank(3, 7)}),
         "unet": lambda: XToTouchPipeline(**{**x_components, "unet": unclip}),
         "sensors": lambda: XToTouchPipeline(**x_components, sensors=["gelsight"]),
-        "from_pipe": lambda: TouchToImagePipeline.from_pipe(pipe, unitouche=None),
-        "pipeline": lambda: TouchToImagePipeline.from_pipe(StableDiffusionPipeline(**stable, **optional)),
     }.items():  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}`"):
+            make()
+    for name, make in {
+        "unitouche": lambda: TouchToImagePipeline.from_pipe(pipe, unitouche=None),
+        "image_normalizer": lambda: TouchToImagePipeline.from_pipe(StableDiffusionPipeline(**stable, **optional)),
+    }.items():
+        with pytest.raises(TypeError, match=f"'{name}'"):
             make()

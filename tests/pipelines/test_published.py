@@ -48,13 +48,12 @@ def test_the_picture_is_that_of_the_parts_put_together_by_hand(parts, touch, tmp
     assert {one.dtype for one in (half.unet, half.vae, half.text_encoder, half.unitouch)} == {torch.bfloat16}
 
 
-def test_the_norm_of_embeddings_is_the_normalisers_or_given(parts, touch):
+def test_the_norm_of_embeddings_is_the_normalisers(parts, touch):
     pipe = to_image(parts["unclip"], parts["joint"])
     drawn = pipe.image_normalizer.unscale(torch.randn(20_000, 16, generator=seeded())).detach()
     expected = math.sqrt(float(drawn.double().square().sum(dim=1).mean()))
-    for options, norm in (({}, expected), ({"embedding_norm": 7.5}, 7.5)):
-        found = to_image(parts["unclip"], parts["joint"], **options).encode_touch(touch, strength=1.0)
-        assert found.norm(dim=1).tolist() == pytest.approx([norm] * 2, rel=0.01)
+    found = pipe.encode_touch(touch, strength=1.0)
+    assert found.norm(dim=1).tolist() == pytest.approx([expected] * 2, rel=0.01)
 
 
 def test_photos_are_encoded_by_the_joint_space_or_else_by_the_unclip(parts, photo, touch, tmp_path):
@@ -85,8 +84,7 @@ def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, mo
     [("./gone", "joint", {}, "unclip"), ("unclip", "../gone", {}, "unitouch"), ("joint", "joint", {}, "unclip"),
      ("unclip", "unclip", {}, "unitouch"), ("pickled", "joint", {}, "unclip"), ("broken", "joint", {}, "unclip"),
      ("unclip", "narrow", {}, "unitouch"), ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
-     ("unclip", "joint", {"embedding_norm": 0.0}, "embedding_norm"),
-     ("unclip", "joint", {"colour": 3}, "from_published")],
+     ],
 )  # fmt: skip
 def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path, unclip, joint, options, named):
     places = dict(parts)
