@@ -53,8 +53,6 @@ SensorNames = str | Sequence[str | None] | None
 Method = TypeVar("Method", bound=Callable[..., Any])
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
-MAX_IMAGES = 100_000  # maximum per input
-MAX_SIDE = 16_384  # pixels
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
 SMALL_NETWORK = 20_000_000  # parameters; on a CPU, threads of a smaller one mostly wait for each other
@@ -161,7 +159,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         init_strength: Any = 1.0,
     ) -> CallSettings:  # fmt: skip
         """The validated arguments of a call with `inputs` inputs; `None` is the checkpoint's default."""
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, 100_000)
         check_choice("output_type", output_type, ("pil", "np", "pt", "latent"))
         check_kind("throw", throw, bool)
         lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
@@ -188,7 +186,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         trained = trained if isinstance(trained, list | tuple) else (trained, trained)
         sides = []
         for name, given, side in zip(("height", "width"), (height, width), trained, strict=True):
-            pixels = check_integer(name, side * factor if given is None and side else given, factor, MAX_SIDE)
+            pixels = check_integer(name, side * factor if given is None and side else given, factor, 16_384)
             if pixels % factor:
                 raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {factor}.")
             sides.append(pixels // factor)
@@ -230,10 +228,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if background is None:
             return Touches(pixels, model.match_sensors(pixels, sensor))
         backgrounds = self.processor.images(background, name="background")
-        if len(backgrounds) not in (1, len(pixels)):
-            raise InvalidInputError(
-                f"`background` holds {len(backgrounds)} images for {len(pixels)} touches; pass one, or one each."
-            )
+        check_count("background", len(backgrounds), len(pixels))
         backgrounds = backgrounds.expand_as(pixels)
         matches = model.match_sensors(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
@@ -349,9 +344,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 progress=lambda share: bar.update(round(share * total) - bar.n),
             )
         self._guidance_scale, self._num_timesteps = caller._guidance_scale, total  # as diffusers leaves them
-        if unguided := report.evaluations - report.guided:
-            where = f" in {unguided} of {report.evaluations} evaluations" if report.guided else ""
-            report.left_out.append(f"unconditional branch{where}")
+        if not report.guided:
+            report.left_out.append("unconditional branch")
         return result
 
     # In a callback: of the running call. Elsewhere: of the last one.
@@ -399,10 +393,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         folder = local_folder(name, pretrained_model_name_or_path, **kwargs)
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
-            conditioning = ("embedding_bank", "backgrounds", "image_normalizer", "language_bridge")
-            for part in ("unet", "vae", "text_encoder", *conditioning):
-                if part not in kwargs:
-                    check_filled(folder / part, getattr(pipe, part, None))
+            conditioning = {"embedding_bank", "backgrounds", "image_normalizer", "language_bridge"}
+            for part in {"unet", "vae", "text_encoder", *conditioning} - kwargs.keys():
+                check_filled(folder / part, getattr(pipe, part, None))
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
         return pipe
 
@@ -485,6 +478,12 @@ def check_unused(instead: str, **given: Any) -> None:
     for name, value in given.items():
         if value is not None:
             raise InvalidInputError(f"`{name}` has no effect with `{instead}`; leave one of them out.")
+
+
+def check_count(name: str, count: int, inputs: int) -> None:
+    """Raises unless there is one for all of the inputs, or one for each."""
+    if count not in (1, inputs):
+        raise InvalidInputError(f"`{name}` holds {count} for {inputs} inputs; pass one, or one each.")
 
 
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:

@@ -93,45 +93,28 @@ class Card:
             (folder / PICTURES).mkdir(exist_ok=True)
             shutil.copyfile(file, folder / place)
             images += f"![{caption}]({place})\n\n*{caption}*\n\n"
-        figures = "\n".join(f"| {key} | {value} |" for key, value in self.figures.items())
-        content = TEMPLATE.format(
-            data=ModelCardData(
-                license=self.license.lower() or None,
-                library_name="diffusers",
-                pipeline_tag=pipe._task,
-                tags=["unitouch_gen", "touch", "tactile"],
-            ).to_yaml(),
-            title=Path(name).name,
-            description=self.description or str(type(pipe).__doc__).splitlines()[0],
-            images=images,
-            kind=type(pipe).__name__,
-            name=name,
-            call=pipe._example_call,
-            end=pipe._example_end,
-            figures=f"| figure | measured |\n|---|---|\n{figures}" if figures else "Not stated.",
-            trained_on=self.data or "Not stated.",
-            limits=self.limits,
-            license=self.license or "Not stated: ask who made it before you use it.",
+        rows = "".join(f"\n| {key} | {value} |" for key, value in self.figures.items())
+        figures = f"| figure | measured |\n|---|---|{rows}" if rows else "Not stated."
+        tags = ["unitouch_gen", "touch", "tactile"]
+        data = ModelCardData(
+            license=self.license.lower() or None, library_name="diffusers", pipeline_tag=pipe._task, tags=tags
         )
-        ModelCard(content).save(folder / CARD)
-
-
-TEMPLATE = """---
-{data}
+        content = f"""---
+{data.to_yaml()}
 ---
 
-# {title}
+# {Path(name).name}
 
-{description}
+{self.description or str(type(pipe).__doc__).splitlines()[0]}
 
 {images}## How to use it
 
 ```python
-from unitouch_gen import {kind}, example  # pip install unitouch_gen
+from unitouch_gen import {type(pipe).__name__}, example  # pip install unitouch_gen
 
-pipe = {kind}.from_pretrained("{name}")
-output = {call}  # or paths of your own
-{end}
+pipe = {type(pipe).__name__}.from_pretrained("{name}")
+output = {pipe._example_call}  # or paths of your own
+{pipe._example_end}
 print(output.report)
 ```
 
@@ -144,13 +127,14 @@ is `pipeline.py`, which imports `unitouch_gen`.
 
 ## What it was trained on
 
-{trained_on}
+{self.data or "Not stated."}
 
 ## What it cannot do
 
-{limits}
+{self.limits}
 
 ## Licence
 
-{license}
+{self.license or "Not stated: ask who made it before you use it."}
 """
+        ModelCard(content).save(folder / CARD)

@@ -1,7 +1,6 @@
 """`TactileStylizationPipeline`: a photo restyled by a touch (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -17,54 +16,45 @@ from unitouch_gen.pipelines.base import (
     SensorNames,
     StepEndCallback,
     Touches,
+    check_count,
     check_weights,
     runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
-from unitouch_gen.sampling import Network, RunReport
+from unitouch_gen.sampling import Network, RunReport, trained_for
 from unitouch_gen.schedule import NoiseSchedule, to_denoised
 
 MIXES = {"linear": mix_to_norm, "paper": mix_linear}
 
 
-class LayoutHold:
-    """Holds the layout of photos while a network denoises, as ILVR does (Choi et al., 2021, Equation 8).
+def coarse(values: Tensor, cells: int, keep_colours: bool) -> Tensor:
+    """The part of (B, C, h, w) on a grid of so many cells along the shorter side, with or without the mean."""
+    size = values.shape[-2:]
+    share = min(cells / min(size), 1.0)
+    averages = F.interpolate(values, [max(round(share * side), 1) for side in size], mode="bilinear", antialias=True)
+    smooth = F.interpolate(averages, size, mode="bicubic")
+    return smooth if keep_colours else smooth - smooth.mean(dim=(2, 3), keepdim=True)
 
-    The coarse part F of what the network predicts of the clean latents becomes that of the photo's latents:
+
+def hold_layout(
+    network: Network, photo: Tensor, schedule: NoiseSchedule, prediction_type: str, cells: int, keep_colours: bool
+) -> Network:
+    """A network that holds the layout of photos, as ILVR does (Choi et al., 2021, Equation 8).
+
+    The coarse part F of what it predicts of the clean latents becomes that of the photos' latents (B, C, h, w):
     D' = D + F(photo - D). Only the denoiser changes: every solver, adaptive steps and guidance run as they are.
-
-    Args:
-        scheduler: Of the network, with noise levels to choose from.
-        cells: F averages over a grid of so many cells along the shorter side, and interpolates between them.
-        keep_colours: Whether the mean of each channel is held, too.
     """
 
-    def __init__(self, scheduler: Any, cells: int, keep_colours: bool):
-        self.schedule, self.prediction_type = NoiseSchedule.of(scheduler), scheduler.config.prediction_type
-        self.cells, self.keep_colours = cells, keep_colours
+    def held(z: Tensor, timestep: Tensor) -> Tensor:
+        prediction, sigma = network(z, timestep).float(), schedule.sigma(timestep.cpu()).item()
+        denoised = to_denoised(prediction, z, sigma, prediction_type)
+        one = torch.ones((), dtype=torch.float32)
+        slope = to_denoised(one, 0.0 * one, sigma, prediction_type).item()  # dD / dprediction
+        target = photo.float().repeat(len(z) // len(photo), 1, 1, 1)
+        return prediction + coarse(target - denoised, cells, keep_colours) / slope
 
-    def coarse(self, values: Tensor) -> Tensor:
-        """F: the part of (B, C, h, w) that is held."""
-        size = values.shape[-2:]
-        share = min(self.cells / min(size), 1.0)
-        grid = [max(round(share * side), 1) for side in size]
-        cells = F.interpolate(values, grid, mode="bilinear", antialias=True)
-        smooth = F.interpolate(cells, size, mode="bicubic")
-        return smooth if self.keep_colours else smooth - smooth.mean(dim=(2, 3), keepdim=True)
-
-    def wrap(self, network: Network, photo: Tensor) -> Network:
-        """The network with D' in place of D, of photos' latents (B, C, h, w); states (B or 2 B, C, h, w)."""
-
-        def held(z: Tensor, timestep: Tensor) -> Tensor:
-            prediction, sigma = network(z, timestep).float(), self.schedule.sigma(timestep.cpu()).item()
-            denoised = to_denoised(prediction, z, sigma, self.prediction_type)
-            one = torch.ones((), dtype=torch.float32)
-            slope = to_denoised(one, 0.0 * one, sigma, self.prediction_type).item()  # dD / dprediction
-            target = photo.float().repeat(len(z) // len(photo), 1, 1, 1)
-            return prediction + self.coarse(target - denoised) / slope
-
-        return held
+    return held
 
 
 class TactileStylizationPipeline(TouchToImagePipeline):
@@ -126,9 +116,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         strength = check_number("strength", strength, 0.0, MAX_SCALE)
         check_choice("mix", mix, MIXES)
         check_kind("keep_colours", keep_colours, bool)
-        hold = None
         if layout is not None:
-            hold = LayoutHold(self.scheduler, check_integer("layout", layout, 2), keep_colours)
+            cells, (schedule, prediction_type) = check_integer("layout", layout, 2), trained_for(self.scheduler)
         if touch_weight is None:
             touch_weight = 0.3 if layout is None else 0.7
         if image_weight is None:
@@ -139,10 +128,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             if value is None:
                 raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
         touches, photos = self._prepare_touch(touch, sensor, background), self.processor.images(image)
-        sizes = (len(photos), len(touches.pixels))
-        if min(sizes) not in (1, max(sizes)):
-            raise InvalidInputError(f"`image` holds {sizes[0]} photos and `touch` {sizes[1]}; pass one, or one each.")
-        batch_size = max(sizes)
+        fewer, batch_size = sorted((len(photos), len(touches.pixels)))
+        check_count("image, touch", fewer, batch_size)
         settings = self._check_call(
             batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
             max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
@@ -158,14 +145,15 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         # 3. Encode the photo's own latents
         photo: Any = None
-        if init_strength < 1.0 or hold is not None:
+        if init_strength < 1.0 or layout is not None:
             with report.stage("photo latents"):
                 photo = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
                 photo = photo.repeat_interleave(settings.repeats, dim=0)
 
         # 4. Generate from the mixed embedding
         init = photo if init_strength < 1.0 else None
-        wrap = None if hold is None else partial(hold.wrap, photo=photo)
+        held = None if layout is None else (photo, schedule, prediction_type, cells, keep_colours)
+        wrap = None if held is None else lambda network: hold_layout(network, *held)
         images = self._generate(settings, embeds, noise_level, prompts, report, init, wrap)
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 

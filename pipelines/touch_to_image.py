@@ -39,6 +39,7 @@ from unitouch_gen.pipelines.base import (
     StepEndCallback,
     Touches,
     UniTouchPipeline,
+    check_count,
     check_unused,
     runs_networks,
 )
@@ -319,8 +320,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 given = check_texts(name, default if prompt is None else prompt)
                 given = given * batch_size if len(given) == 1 else given
                 lengths.add(self.tokenizer.model_max_length)
-            if len(given) not in (1, batch_size):
-                raise InvalidInputError(f"`{name}` holds {len(given)} for {batch_size} inputs; pass one, or one each.")
+            check_count(name, len(given), batch_size)
             found.append(given)
         if len(lengths) > 1:
             raise InvalidInputError(

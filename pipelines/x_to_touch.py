@@ -29,6 +29,7 @@ from unitouch_gen.pipelines.base import (
     StepEndCallback,
     Touches,
     UniTouchPipeline,
+    check_count,
     check_unused,
     check_weights,
     runs_networks,
@@ -260,10 +261,7 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
         sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]
         for name, size in zip(inputs, sizes, strict=True):
-            if size not in (1, max(sizes)):
-                raise InvalidInputError(
-                    f"`{name}` holds {size} inputs, where another modality holds {max(sizes)}; pass one, or one each."
-                )
+            check_count(name, size, max(sizes))
         weights = dict.fromkeys(given, 1.0) if weights is None else weights
         if set(check_kind("weights", weights, Mapping)) != set(given):
             named = ", ".join(map(str, weights))

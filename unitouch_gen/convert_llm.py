@@ -61,7 +61,6 @@ def read_touch_llm(
     except (KeyError, RuntimeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error).splitlines()[-1].strip(" .")
         raise InvalidInputError(f"`bridge` is {str(bridge)!r}, which does not fit this LLaMA: {why}.") from error
-    made.check_fits(model)
     model.config.max_position_embeddings = min(POSITIONS, model.config.max_position_embeddings)
     model.generation_config.update(**SAMPLING)
     parts = {"language_bridge": made.to(dtype).eval(), "language_model": model.to(dtype=dtype).eval()}
