@@ -37,6 +37,7 @@ from unitouch_gen.errors import (
     check_kind,
     check_number,
     check_tensor,
+    check_unused,
     describe,
 )
 from unitouch_gen.files import as_path, local_folder, reading, writing_folder
@@ -55,8 +56,6 @@ StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tens
 
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
-SMALL_NETWORK = 20_000_000  # parameters; on a CPU, threads of a smaller one mostly wait for each other
-
 _threads: list[int] = []  # for each running call, how many threads torch had before the first of them
 
 
@@ -65,7 +64,8 @@ def runs_networks(method: Method) -> Method:
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < SMALL_NETWORK
+        # On a CPU, threads of a network with fewer parameters mostly wait for each other.
+        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < 20_000_000
         _threads.append([*_threads, torch.get_num_threads()][0])
         torch.set_num_threads(1 if small else _threads[0])
         try:
@@ -202,8 +202,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _check_callback(self, callback: Any, inputs: Sequence[str], tolerance: float | None) -> Sequence[str]:
         """Names of the tensors a callback gets; diffusers' own callbacks list theirs."""
         if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
-            if tolerance is not None:
-                raise InvalidInputError("`callback_on_step_end` counts steps, but `tolerance` does not; leave one out.")
+            check_unused("callback_on_step_end", tolerance=tolerance)  # it counts steps
             inputs = callback.tensor_inputs
         if callback is not None and not callable(callback):
             raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; pass a function.")
@@ -471,13 +470,6 @@ def check_filled(folder: Path, network: Any) -> None:
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."
         )
-
-
-def check_unused(instead: str, **given: Any) -> None:
-    """Raises if an argument has no effect together with `instead`."""
-    for name, value in given.items():
-        if value is not None:
-            raise InvalidInputError(f"`{name}` has no effect with `{instead}`; leave one of them out.")
 
 
 def check_count(name: str, count: int, inputs: int) -> None:

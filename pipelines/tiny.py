@@ -31,9 +31,6 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
 FOLDERS = {"stylization": "touch-to-image"}
 """Folder of a pipeline's networks, where it is not named after the pipeline."""
 
-WITH_BANK = (TactileStylizationPipeline, XToTouchPipeline)
-"""Pipelines that get the embedding bank. Without it, pictures and answers keep more of a touch's grain and place."""
-
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
 """Distilled pipelines, and those that they were distilled from, whose folders hold the LoRA weights in `turbo`."""
 
@@ -75,7 +72,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         joint, processor = joint_space(family, dtype)
         parts: dict[str, Any] = {"unitouch": joint, "processor": processor}
         parts |= read_settings("family", family / teacher / "defaults.json")
-        if kind in WITH_BANK and (family / "embedding-bank").is_dir():
+        # Without a bank, pictures and answers keep more of a touch's grain and place.
+        if kind in (TactileStylizationPipeline, XToTouchPipeline) and (family / "embedding-bank").is_dir():
             parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
         if kind is TouchToTextPipeline:
             language = folder / "language_model"

@@ -27,6 +27,7 @@ from unitouch_gen.errors import (
     check_number,
     check_tensor,
     check_texts,
+    check_unused,
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
@@ -40,7 +41,6 @@ from unitouch_gen.pipelines.base import (
     Touches,
     UniTouchPipeline,
     check_count,
-    check_unused,
     runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput

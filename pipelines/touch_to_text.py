@@ -21,6 +21,7 @@ from unitouch_gen.errors import (
     check_kind,
     check_tensor,
     check_texts,
+    check_unused,
     did_you_mean,
     first_line,
 )  # fmt: skip
@@ -28,7 +29,7 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, check_unused, check_weights, runs_networks
+from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, check_weights, runs_networks
 from unitouch_gen.pipelines.output import AnswerReport, TouchToTextPipelineOutput
 from unitouch_gen.pipelines.published import read_joint
 
@@ -190,8 +191,6 @@ class TouchToTextPipeline(UniTouchPipeline):
         known -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are ours to say
         for name in given.keys() - known:
             raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
-        if given.get("streamer") is not None and len(prompts) > 1:
-            raise InvalidInputError(f"`streamer` is for one answer, not for {len(prompts)}; leave it out.")
         for name in ("num_beams", "num_return_sequences"):
             check_integer(name, given.get(name, 1), 1)
         with usable(given):

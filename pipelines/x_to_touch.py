@@ -16,6 +16,7 @@ from unitouch_gen.errors import (
     check_kind,
     check_tensor,
     check_texts,
+    check_unused,
     describe,
 )
 from unitouch_gen.models.images import ImageInput, load_images
@@ -30,7 +31,6 @@ from unitouch_gen.pipelines.base import (
     Touches,
     UniTouchPipeline,
     check_count,
-    check_unused,
     check_weights,
     runs_networks,
 )
@@ -87,11 +87,8 @@ class XToTouchPipeline(UniTouchPipeline):
             "`unet`", default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
         )  # fmt: skip
-        config = unet.config
-        if config.class_embed_type is not None:
-            raise InvalidInputError(f"`unet` takes class labels of the kind {config.class_embed_type!r}, as unCLIP's.")
         others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
-        labels = config.num_class_embeds or 0
+        labels = unet.config.num_class_embeds or 0
         if labels != len(sensors) + others:
             raise InvalidInputError(f"`sensors` names {len(sensors)}, but `unet` has {labels - others} to be named.")
         if others and (backgrounds is None or backgrounds.config["count"] != len(sensors)):
@@ -222,9 +219,7 @@ class XToTouchPipeline(UniTouchPipeline):
         with report.stage("decoding"):
             images = self._images(settings, result, report)
         self.maybe_free_model_hooks()
-        if not return_dict:
-            return images, report
-        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 
     def _background_latents(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
         """Latents (B n, C, h, w) of untouched gels: of the given images, or those stored with the checkpoint."""

@@ -147,6 +147,13 @@ def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "
     raise InvalidInputError(f"`{name}` is {describe(value)}; {wanted}".strip())
 
 
+def check_unused(instead: str, **given: Any) -> None:
+    """Raises if an argument has no effect together with `instead`."""
+    for name, value in given.items():
+        if value is not None:
+            raise InvalidInputError(f"`{name}` is {describe(value)}, but has no effect with `{instead}`; pass one.")
+
+
 def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     """A tensor of finite values; the message counts the others."""
     if bad := int((~tensor.isfinite()).sum()):

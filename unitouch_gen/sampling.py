@@ -28,6 +28,7 @@ from unitouch_gen.errors import (
     check_kind,
     check_number,
     check_tensor,
+    check_unused,
     describe,
 )
 from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
@@ -142,11 +143,7 @@ def prepare_steps(
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
     if tolerance is not None:
-        for name, value in {"num_inference_steps": num_inference_steps, "solver": solver, "eta": eta or None}.items():
-            if value is not None:
-                raise InvalidInputError(
-                    f"`{name}` is {describe(value)}, but `tolerance` sets the steps; leave one out."
-                )
+        check_unused("tolerance", num_inference_steps=num_inference_steps, solver=solver, eta=eta or None)
         check_number("tolerance", tolerance, 1e-5, 1.0)
         limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
         schedule, prediction_type = trained_for(scheduler)
