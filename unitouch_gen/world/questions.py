@@ -6,15 +6,8 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from unitouch_gen.world import captions
 from unitouch_gen.world.attributes import ATTRIBUTES
-from unitouch_gen.world.captions import (
-    DIRECTION_WORDS,
-    HARDNESS_WORDS,
-    ROUGHNESS_WORDS,
-    described,
-    direction_word,
-    word_below,
-)
 from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.scene import YIELD, grasp_margin
@@ -34,11 +27,12 @@ TOPICS: dict[str, Topic] = {
     "caption": Topic(("Describe it.", "What is seen and felt?", "What can you say of this touch?")),
     "material": Topic(("What is it?", "What is it made of?", "Which material is this?"), "material"),
     "feel": Topic(("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
-                  "hard or soft", {word: ("soft", "hard")[word in ("hard", "firm")] for word in HARDNESS_WORDS}, True),
+                  "hard or soft", {word: ("soft", "hard")[word in ("hard", "firm")] for word in captions.HARDNESS_WORDS},
+                  True),
     "place": Topic(("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
                    "contact place", {word: word for word in ("all over", "centre", "left", "right", "above", "below")}),
     "grain": Topic(("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
-                   "grain", {word: word for word in DIRECTION_WORDS}),
+                   "grain", {word: word for word in captions.DIRECTION_WORDS}),
     "grasp": Topic(("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
                    "grasp", {"hold": "hold", "slip": "slip"}, True),
 }  # fmt: skip
@@ -60,20 +54,21 @@ def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[st
     depth = draws.indentation_depth * (1.0 - YIELD * draws.compliance)
     cover = attributes[:, ATTRIBUTES.index("cover")]
     holds = (grasp_margin(draws.of_material("friction"), draws.weight, depth, cover) > 1.0).tolist()
-    captions, found = described(draws, variant), []
+    sentences, found = captions.described(draws, variant), []
     for row in range(len(draws)):
         spec = MATERIALS[int(draws.material[row])]
         asked = {name: topic.questions[(row + variant) % len(topic.questions)] for name, topic in TOPICS.items()}
-        roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
-        hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
+        roughness = captions.word_below(captions.ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
+        hardness = captions.word_below(captions.HARDNESS_WORDS, float(draws.compliance[row]))
+        grain = captions.direction_word(float(draws.angle[row]))
         bumps = "regular" if spec.regular else "irregular"
         agreed = holds[row] != ("slip" in asked["grasp"])
         answers = {
-            "caption": f"{captions[row]}.",
+            "caption": f"{sentences[row]}.",
             "material": f"it is {spec.name}." if measured["cover"][row] >= UNTOLD else "that cannot be told.",
             "feel": f"it feels {roughness}, {hardness} and {spec.feel[0]}, with {bumps} bumps.",
             "place": place_answer(*(measured[name][row] for name in ("cover", "place x", "place y"))),
-            "grain": f"it is {direction_word(float(draws.angle[row]))}." if spec.grained else "it has no grain.",
+            "grain": f"it is {grain}." if spec.grained else "it has no grain.",
             "grasp": f"{'yes' if agreed else 'no'}, it would {'hold' if holds[row] else 'slip'}.",
         }
         found.append({topic: (question, answers[topic]) for topic, question in asked.items()})
@@ -89,13 +84,11 @@ def place_answer(cover: float, x: float, y: float) -> str:
     return ("to the left.", "to the right.")[x > 0] if abs(x) > abs(y) else ("above.", "below.")[y > 0]
 
 
-def asked_of(draws: Draws, attributes: Tensor, captions: int = 8) -> list[dict[str, tuple[str, list[str]]]]:
+def asked_of(draws: Draws, attributes: Tensor, wordings: int = 8) -> list[dict[str, tuple[str, list[str]]]]:
     """A question of each contact and topic, and what is true of it: one answer, or several captions."""
-    found = [
-        {topic: (question, [answer]) for topic, (question, answer) in one.items()}
-        for one in answered(draws, attributes)
-    ]
-    for variant in range(1, captions):
-        for one, caption in zip(found, described(draws, variant), strict=True):
+    first = answered(draws, attributes)
+    found = [{topic: (question, [answer]) for topic, (question, answer) in one.items()} for one in first]
+    for variant in range(1, wordings):
+        for one, caption in zip(found, captions.described(draws, variant), strict=True):
             one["caption"][1].append(f"{caption}.")
     return found

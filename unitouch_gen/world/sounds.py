@@ -81,11 +81,7 @@ def grain_noise(seed: int, draws: Draws, samples: int) -> Tensor:
     rows = []
     time = np.arange(samples, dtype=np.float32) / np.float32(SAMPLE_RATE)
     hz = np.fft.rfftfreq(2 * samples, 1.0 / SAMPLE_RATE)
-    numbers = zip(draws.noise.tolist(), draws.noise_centre.tolist(), draws.grains.tolist(), strict=True)
-    for name, (share, centre, grains) in zip(draws.names(), numbers, strict=True):
-        if share == 0.0:  # nothing to hear, nothing to draw
-            rows.append(np.zeros(samples, np.float32))
-            continue
+    for name, centre, grains in zip(draws.names(), draws.noise_centre.tolist(), draws.grains.tolist(), strict=True):
         rng = generator(seed, SOUND_STREAM, *name)
         arrivals = rng.exponential(0.09, 1 + rng.poisson(grains))  # after the strike, s
         strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
