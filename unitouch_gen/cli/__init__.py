@@ -9,13 +9,12 @@ from typing import Annotated
 import typer
 
 from unitouch_gen import __version__
+from unitouch_gen.cli.answers import ask, classify
 from unitouch_gen.cli.app import app
-from unitouch_gen.cli.ask import ask
 from unitouch_gen.cli.batch import batch
-from unitouch_gen.cli.classify import classify
 from unitouch_gen.cli.convert import app as convert
+from unitouch_gen.cli.convert import distill
 from unitouch_gen.cli.data import app as data
-from unitouch_gen.cli.distill import distill
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.numerics import stability, work_precision

@@ -1,11 +1,14 @@
-"""`unitouch-gen convert unitouch` and `touch-llm`: published checkpoints as folders of safetensors."""
+"""Models made of others: `unitouch-gen convert unitouch` and `touch-llm` of checkpoints, `distill` of a pipeline."""
 
 from pathlib import Path
 from typing import Annotated
 
 from typer import Option, Typer, echo
 
+from unitouch_gen.cli.loading import folder_of
 from unitouch_gen.cli.options import FILE
+from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.files import read_settings
 
 app = Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
@@ -24,8 +27,6 @@ def unitouch(
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
     from unitouch_gen.convert import convert_published
-    from unitouch_gen.errors import InvalidInputError, check_dtype
-    from unitouch_gen.files import read_settings
     from unitouch_gen.models import UniTouchConfig
 
     if touch is None and imagebind is None:
@@ -51,10 +52,30 @@ def touch_llm(
 
     Example: unitouch-gen convert touch-llm --bridge checkpoint.pth --llama llama-7b --unitouch unitouch -o touch-llm
     """
-    from unitouch_gen.errors import check_dtype
     from unitouch_gen.pipelines import TouchToTextPipeline
 
     kind = check_dtype("--dtype", dtype)
     TouchToTextPipeline.from_published(bridge, llama, unitouch, dtype=kind).save_pretrained(output)
     echo("Licence: CC-BY-NC-4.0, as UniTouch's, and LLaMA's own; not for commercial use")
     echo(f"The pipeline is in {output.resolve()}")
+
+
+def distill(
+    model: Annotated[str, Option(help="Folder or repository id of a saved pipeline.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
+    recipe: Annotated[str, Option(help="A YAML file, or the name of a recipe of the package.")] = "distill",
+    overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
+    cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
+    resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
+) -> None:
+    """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (LCM-LoRA).
+
+    Example: unitouch-gen distill --model my-pipeline -o runs/turbo
+    """
+    folder = folder_of(model)
+    from unitouch_gen.training.distill import DistillRecipe, main
+    from unitouch_gen.training.stages import run_stage
+
+    given = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume}
+    run_stage("distill", DistillRecipe, main, model=folder, output=output, **given)
+    echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")

@@ -5,16 +5,9 @@ from typing import Annotated
 
 from typer import Argument, Exit, Option, Typer, echo
 
-from unitouch_gen.cli.options import is_quiet, print_table
+from unitouch_gen.cli.options import Materials, by_comma, is_quiet, print_table
 
-app = Typer(no_args_is_help=True, help="Data sets to train on.")
-
-Materials = Annotated[str | None, Option(help="Names of its materials by comma, in the order of their numbers.")]
-
-
-def names_of(materials: str | None) -> list[str] | None:
-    """`--materials` as `open_dataset` takes them."""
-    return None if materials is None else [name.strip() for name in materials.split(",")]
+app = Typer(no_args_is_help=True)
 
 
 @app.callback()
@@ -36,7 +29,7 @@ def check(
     from unitouch_gen.training.data import check as checking
     from unitouch_gen.training.data import open_dataset
 
-    data = open_dataset(path, kind, sensor=sensor, materials=names_of(materials))
+    data = open_dataset(path, kind, sensor=sensor, materials=by_comma(materials))
     broken, lines = checking.check(data, is_quiet(False))
     splits, rows = checking.contents(data)
     print_table([data.name, data.kind, "records", *splits], rows)

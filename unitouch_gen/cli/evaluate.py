@@ -12,7 +12,6 @@ from typer import Argument, Option, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.data import Materials, names_of
 from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
 
@@ -48,7 +47,7 @@ def evaluate(
     data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
     kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
     sensor: Annotated[str | None, Option(help="Sensor of all touches of the data sets.")] = None,
-    materials: Materials = None,
+    materials: options.Materials = None,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
@@ -67,8 +66,8 @@ def evaluate(
 
     if output is not None:
         options.check_output([output / f"{name}.json" for name in names], overwrite)
-    labels = names_of(materials)
-    folders = [open_dataset(folder, kind, sensor=sensor, materials=labels) for folder in data or ()]
+    given: Any = {"sensor": sensor, "materials": options.by_comma(materials)}
+    folders = [open_dataset(folder, kind, **given) for folder in data or ()]
     pipes = {name: load_pipeline(PIPELINES[name], model=model, device=device) for name in names if name in PIPELINES}
     joint, processor = load_joint_space(model, device)
     for name in tuple(names):

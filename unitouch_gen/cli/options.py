@@ -43,10 +43,11 @@ Images = Annotated[int, Option("--num-images-per-prompt", "--images", min=1, max
 Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 
-# Models
+# Models and data sets
 Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline; built-in if left out.")]
 Dtype = Annotated[str | None, Option(help="float32, float16, bfloat16 or float64; float32 if left out.")]
 Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")]
+Materials = Annotated[str | None, Option(help="Names of its materials by comma, in the order of their numbers.")]
 
 
 def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
@@ -66,6 +67,11 @@ def value_of(word: str) -> Any:
         return json.loads(word)
     except ValueError:
         return word
+
+
+def by_comma(words: str | None) -> list[str] | None:
+    """The words of an option that takes several with commas between them."""
+    return None if words is None else [word.strip() for word in words.split(",")]
 
 
 def check_output(files: Sequence[Path], overwrite: bool) -> None:
