@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Option, echo
 
@@ -14,11 +14,6 @@ from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
-
-if TYPE_CHECKING:
-    from unitouch_gen.models import UniTouchModel
-    from unitouch_gen.training.data import RecordSet
-    from unitouch_gen.training.data.heldout import Sets
 
 TABLES = {
     "material": "Material of touches (Table 2): accuracy, %",
@@ -98,16 +93,13 @@ def evaluate(
 
 def asked_for(table: str, model: str | None) -> list[str]:
     """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
-    made = {*PIPELINES} if model is None else set[str]()
+    kinds = [*PIPELINES.values()] if model is None else []
     if model is not None and (table in PIPELINES or (Path(model) / "model_index.json").is_file()):
-        kind = kind_of(model, [*CLASSES])
-        made = {name for name, pipeline in PIPELINES.items() if pipeline == kind}
-        if table in PIPELINES and table not in made:
-            raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {kind}; name one for {PIPELINES[table]}.")
-    return [name for name in TABLES if name == table or (table == "all" and name not in {*PIPELINES} - made)]
+        kinds = [kind_of(model, [PIPELINES[table]] if table in PIPELINES else [*CLASSES])]
+    return [table] if table != "all" else [name for name in TABLES if PIPELINES.get(name) in (None, *kinds)]
 
 
-def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
+def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: int) -> None:
     """Refuses models and data sets that lack what a table needs, before their files are read."""
     from unitouch_gen.evaluation.tables import GRASP_PROMPTS
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
@@ -119,8 +111,12 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
     if "touch" not in joint.known_modalities or not usable:
         wanted = " or ".join(sorted(asked))
         raise InvalidInputError(f"`--model` has no encoders of touch and {wanted}, which {name!r} needs.")
-    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.config.sensors}):
-        raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
+    if name == "x-to-touch":
+        known = {*(pipe.config.sensors or ())}
+        felt = {record.sensor for data in folders for record in data.records} if folders else known & {*NAMED}
+        if not felt or felt - known:
+            words = ", ".join(sorted(known))
+            raise InvalidInputError(f"The touches are by sensors other than {words}, which `--model` draws for.")
     for data in folders:
         parts = parts_of(data)
         for split, part in parts.items() if label else ():
@@ -131,25 +127,16 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
                 raise InvalidInputError(f"{data} has the classes {has}, not {wanted}.")
         if not label and not usable & {*modalities_of(data)}:
             raise InvalidInputError(f"{data} has no {' or '.join(sorted(usable))} of every touch.")
-        if not all(drawable(name, pipe, record.sensor) for record in data.records):
-            known = ", ".join(pipe.config.sensors or ())
-            raise InvalidInputError(f"{data} was felt by sensors other than {known}, which the model draws for.")
         least = each * len({record.labels.get("material") for record in parts["test"].records}) + 2
         if name in GENERATED and len(parts["test"]) < least:
             raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
-
-
-def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
-    """Whether a table is possible of touches by a sensor; that of x-to-touch draws them by the same one."""
-    return name != "x-to-touch" or sensor in (pipe.config.sensors or ())
 
 
 # Figures --------------------------------------------------------------------------------------------------------------
 
 
 def figures_of(
-    names: Sequence[str], sets: "Sets", joint: "UniTouchModel", processor: Any, pipes: Mapping[str, Any], each: int,
-    judge: Path | None = None,
+    names: Sequence[str], sets: Any, joint: Any, processor: Any, pipes: Mapping[str, Any], each: int, judge: Path | None
 ) -> dict[str, Figures]:  # fmt: skip
     """Figures of each table."""
     import torch
@@ -178,13 +165,12 @@ def figures_of(
                 found = tables.retrieval_table(splits)
             elif name == "caption":
                 found = caption_table(pipes[name], splits, embed, each, judge)
-            elif (name, domain, seed) not in drawn and all(
-                drawable(name, pipes[name], one) for one in splits["test"].sensors
-            ):
-                drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
-                found = drawing[name](pipes[name], splits, judges, each, seed)
             else:
-                continue
+                pipe, felt = pipes[name], {*splits["test"].sensors}
+                if (name, domain, seed) in drawn or (name == "x-to-touch" and not felt <= {*pipe.config.sensors}):
+                    continue
+                drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
+                found = drawing[name](pipe, splits, judges, each, seed)
             for row, values in found.items():
                 columns = made[name].setdefault(row if name in asking else f"{row}, {domain}", {})
                 for column, value in values.items():
