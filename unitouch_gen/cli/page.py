@@ -1,8 +1,7 @@
 """The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,13 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
     """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it asks no other host."""
     titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch",
               "touch-to-text": "Ask"}  # fmt: skip
-    fields = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields}
     # Uploads and pictures stay on the disk for an hour.
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, touches of anything, and answers about touches.")
         with gradio.Tabs():
             for kind in [kind for kind in titles if kind in pipes]:
                 with gradio.Tab(titles[kind]):
-                    if kind == "touch-to-text":
-                        asking_tab(pipes[kind])
-                    else:
-                        tab(pipes[kind], fields[kind], kind == "touch-to-image")
+                    tab(pipes[kind], kind)
     system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
     css = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"  # phones
     page.queue(max_size=16, default_concurrency_limit=1).launch(
@@ -41,44 +36,37 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
     return page
 
 
-def tab(pipe: Any, make_fields: Any, names_touches: bool) -> None:
+def tab(pipe: Any, kind: str) -> None:
     """The tab of a pipeline."""
+    asking = kind == "touch-to-text"
     with gradio.Row():
         with gradio.Column():
-            fields = make_fields(pipe) | solver_fields(pipe)
-            button = gradio.Button("Make it", variant="primary")
+            fields = FIELDS[kind](pipe) | ({} if asking else solver_fields(pipe))
+            button = gradio.Button("Ask" if asking else "Make it", variant="primary")
         with gradio.Column():
+            if asking:
+                first: Any = gradio.Textbox(label="Answer")
+            else:
+                first = gradio.Gallery(label="Pictures", format="png", columns=2, height=600)
             results = [
-                gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
-                gradio.Textbox(label="Feels like", visible=names_touches),
+                first,
+                gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
                 gradio.Textbox(label="Run report", lines=3),
-                gradio.Textbox(label="Seed that was used"),
+                gradio.Textbox(label="Seed that was used", visible=not asking),
             ]
     bar = gradio.Progress()
 
     def run(given: dict[Any, Any], progress: gradio.Progress = bar) -> tuple[Any, ...]:
-        return answer(pipe, {name: given[part] for name, part in fields.items()}, progress)
+        values = {name: given[part] for name, part in fields.items() if given[part] not in (None, "")}
+        try:
+            return answer(pipe, values, progress)
+        except (ValueError, TypeError, ArithmeticError) as error:
+            message = first_line(error)
+            for value in values.values():  # uploads by their names
+                message = message.replace(value, Path(value).name) if isinstance(value, str) else message
+            raise gradio.Error(message, duration=None, print_exception=False) from error
 
     button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
-
-
-def asking_tab(pipe: Any) -> None:
-    """The tab of a pipeline that answers questions."""
-    with gradio.Row():
-        with gradio.Column():
-            touch = upload("touch", "Touch")
-            asked = [topic.questions[0] for topic in TOPICS.values()]
-            question = gradio.Dropdown(asked, value="How does it feel?", label="Question", allow_custom_value=True)
-            button = gradio.Button("Ask", variant="primary")
-        with gradio.Column():
-            results = [gradio.Textbox(label="Answer"), gradio.Textbox(label="Run report", lines=2)]
-
-    def run(touch: str | None, question: str) -> tuple[str, str]:
-        with refusing([touch or ""]):
-            output = pipe(touch, question)
-        return output.texts[0], str(output.report)
-
-    button.click(run, [touch, question], results, concurrency_id="pipelines", api_visibility="private")
 
 
 # Fields ---------------------------------------------------------------------------------------------------------------
@@ -115,6 +103,18 @@ def any_fields(pipe: Any) -> Fields:
     }
 
 
+def asking_fields(pipe: Any) -> Fields:
+    asked = [topic.questions[0] for topic in TOPICS.values()]
+    return {
+        "touch": upload("touch", "Touch"),
+        "question": gradio.Dropdown(asked, value="How does it feel?", label="Question", allow_custom_value=True),
+    }
+
+
+FIELDS = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields,
+          "touch-to-text": asking_fields}  # fmt: skip
+
+
 def upload(modality: str, label: str) -> Any:
     """A file of a modality, with samples."""
     sources: Any = ["upload", "clipboard"]
@@ -141,12 +141,11 @@ def solver_fields(pipe: Any) -> Fields:
         }
 
 
-# Answers --------------------------------------------------------------------------------------------------------------
-
-
 def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
-    """Pictures, what they feel like, the run report and the seed; errors are shown in the page."""
-    given = {name: value for name, value in given.items() if value not in (None, "")}
+    """Pictures or the answer, what the touch feels like, the run report and the seed."""
+    if "question" in given:
+        output = pipe(**given)
+        return output.texts[0], "", str(output.report), ""
     seed = int(given.pop("seed", random.randrange(2**31)))
     if "tolerance" in given:
         del given["num_inference_steps"]
@@ -155,23 +154,9 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
         progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
         return {}
 
-    with refusing(value for value in given.values() if isinstance(value, str)):
-        generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
-        output = pipe(**given, generator=generator, callback_on_step_end=show)
-    felt = ""
+    generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
+    output, felt = pipe(**given, generator=generator, callback_on_step_end=show), ""
     if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier.name(output.encoded[:1], "touch")[0])
     return output.images, felt, str(output.report), str(seed)
-
-
-@contextmanager
-def refusing(uploads: Iterable[str]) -> Iterator[None]:
-    """Shows the errors of a call in the page, with the names of uploads in place of their paths."""
-    try:
-        yield
-    except (ValueError, TypeError, ArithmeticError) as error:
-        said = first_line(error)
-        for value in filter(None, uploads):
-            said = said.replace(value, Path(value).name)
-        raise gradio.Error(said, duration=None, print_exception=False) from error
