@@ -7,7 +7,7 @@ import inspect
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Context, Exit, Option, echo
 
@@ -16,9 +16,6 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
@@ -136,8 +133,8 @@ def calls_of(pictures: Sequence[Picture], most: int) -> list[list[Picture]]:
     return [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
 
 
-def make(pipe: Any, call: list[Picture]) -> "list[tuple[Image.Image | None, dict[str, Any]]]":
-    """The pictures of a call, each with its line of the manifest; where the call fails, each is tried alone."""
+def make(pipe: Any, call: list[Picture]) -> list[tuple[Any, dict[str, Any]]]:
+    """A call's PIL images, `None` for those that fail, and lines of the manifest; if it fails, each is tried alone."""
     try:
         output = draw(pipe, call)
     except (InvalidInputError, errors.InvalidTypeError, errors.NonFiniteError, errors.NotConvergedError) as error:

@@ -6,13 +6,10 @@ import os
 import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from unitouch_gen.cli.options import note
 from unitouch_gen.errors import InvalidInputError, check_dtype
-
-if TYPE_CHECKING:
-    from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
@@ -110,8 +107,8 @@ def load_pipeline(
     return pipe.to(place)
 
 
-def load_joint_space(model: str | None, device: str) -> "tuple[UniTouchModel, UniTouchProcessor]":
-    """The joint space of a folder, repository or saved pipeline, or the built-in one, with its processor."""
+def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
+    """`UniTouchModel` and `UniTouchProcessor` of a folder, repository or saved pipeline, or the built-in ones."""
     place = device_of(device)
     import transformers.utils.logging
 

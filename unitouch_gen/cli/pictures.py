@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Context, Option, echo
 
@@ -17,12 +17,6 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import files_of, load_pipeline
 from unitouch_gen.cli.options import SEVERAL
 from unitouch_gen.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from PIL import Image
-
-    from unitouch_gen.pipelines import UniTouchPipelineOutput
-    from unitouch_gen.sampling import RunReport
 
 # Commands -------------------------------------------------------------------------------------------------------------
 
@@ -109,7 +103,7 @@ def x_to_touch(
     pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **context.params)
     known = list(pipe.config.sensors)
     drawn = known if sensor and "all" in sensor else sensor or ([] if background else known[:1])
-    rows: list[tuple[dict[str, Any], str]] = []
+    rows = list[tuple[dict[str, Any], str]]()
     for row in range(most):
         own = {name: values[row % len(values)] for name, values in inputs.items()}
         stem = "-".join(map(stem_of, own.values()))
@@ -169,8 +163,8 @@ def unique(names: Sequence[str]) -> list[str]:
     return list(found.values())
 
 
-def draw(pipe: Any, pictures: Sequence[Picture]) -> "UniTouchPipelineOutput":
-    """Makes pictures in one call, each from its own seed: a picture is the same alone and among others."""
+def draw(pipe: Any, pictures: Sequence[Picture]) -> Any:
+    """Output of one call that makes pictures, each from its own seed: a picture is the same alone and among others."""
     import torch
 
     settings = pictures[0].settings
@@ -179,15 +173,15 @@ def draw(pipe: Any, pictures: Sequence[Picture]) -> "UniTouchPipelineOutput":
     return pipe(**{**settings, **inputs}, generator=generator)
 
 
-def save(image: "Image.Image", file: Path) -> None:
-    """Writes a picture whole, or leaves what was there."""
+def save(image: Any, file: Path) -> None:
+    """Writes a PIL image whole, or leaves what was there."""
     from unitouch_gen.files import replacing
 
     with replacing("--output", file) as partial:
         image.save(partial)
 
 
-def described(picture: Picture, report: "RunReport", place: int) -> dict[str, Any]:
+def described(picture: Picture, report: Any, place: int) -> dict[str, Any]:
     """The row of JSON for the picture at a place of its call: file, inputs, and what the report says of the touch."""
     row: dict[str, Any] = {"picture": str(picture.file), **{name: str(value) for name, value in picture.inputs.items()}}
     if report.sensors:
@@ -199,8 +193,7 @@ def described(picture: Picture, report: "RunReport", place: int) -> dict[str, An
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by a command's options, saves those of each call, and prints a table of them and the report."""
-    given, rows = context.params, list[dict[str, Any]]()
-    reports: list[RunReport] = []
+    given, rows, reports = context.params, list[dict[str, Any]](), list[Any]()
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
     processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
@@ -221,10 +214,8 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     if given["as_json"]:
         echo(json.dumps({"pictures": rows, "reports": [report.to_dict() for report in reports]}))
         return
-    noun, first = "touch image" if context.info_name == "x-to-touch" else "picture", pictures[0].file.resolve()
     columns = list(dict.fromkeys(name for row in rows for name in row if name != "sensor_distance"))
-    cells = [[Path(row.get(name) or "-").name for name in columns] for row in rows]
-    options.print_table([noun, *columns[1:]], cells)
-    echo(f"{noun.capitalize()}s are in {first.parent}" if len(rows) > 1 else f"The {noun} is {first}")
+    options.print_table(columns, [[Path(row.get(name) or "-").name for name in columns] for row in rows])
+    echo(f"Pictures are in {pictures[0].file.resolve().parent}")
     seconds = sum(sum(report.seconds.values()) for report in reports)
     echo(f"Run report: {reports[-1]}" + (f"; {len(reports)} such calls, {seconds:.1f} s" if len(reports) > 1 else ""))
