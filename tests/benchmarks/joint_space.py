@@ -18,10 +18,11 @@ from tests.benchmarks.measuring import Figures, attribute_agreement
 from unitouch_gen.evaluation.contacts import Contacts, image_embeddings
 from unitouch_gen.evaluation.controls import class_means, with_controls
 from unitouch_gen.evaluation.metrics import retrieval, share_right
-from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, text_embeddings
+from unitouch_gen.evaluation.zero_shot import PROMPTS, text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.heldout import world_contacts
+from unitouch_gen.world import MATERIAL_NAMES
 
 
 def held_out(
@@ -66,10 +67,11 @@ class JointSpace:
 
 def material_rows(joint: JointSpace, modality: str, features: Tensor, material: Tensor) -> Figures:
     """The share of embeddings whose "material" is named right."""
-    classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor)
+    texts = [PROMPTS[modality].format(name) for name in MATERIAL_NAMES]
+    classes = text_embeddings(joint.models["text"], joint.processor, texts)
 
     def measure(values: Tensor) -> dict[str, float]:
-        return {"material": share_right(classifier.scores(values, modality).argmax(dim=1), material)}
+        return {"material": share_right((F.normalize(values.float(), dim=-1) @ classes.T).argmax(dim=1), material)}
 
     return with_controls(measure, {"value": features, "class_mean": class_means(features, material)})
 

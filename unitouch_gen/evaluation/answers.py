@@ -71,12 +71,10 @@ def caption_table(
 
 def answered(pipe: Any, embeds: Tensor, questions: Sequence[str]) -> list[str]:
     """The likeliest answers to a question about each of N embeddings (N, D)."""
-    parts = [slice(start, start + 64) for start in range(0, len(questions), 64)]
-    return [
-        text
-        for part in parts
-        for text in pipe(touch_embeds=embeds[part], question=list(questions[part]), do_sample=False).texts
-    ]
+    found = list[str]()
+    for part in [slice(start, start + 64) for start in range(0, len(questions), 64)]:
+        found += pipe(touch_embeds=embeds[part], question=list(questions[part]), do_sample=False).texts
+    return found
 
 
 def measured(

@@ -15,8 +15,6 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
-# Retrieval ------------------------------------------------------------------------------------------------------------
-
 
 def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
     """Of queries (Q, D) and a gallery (N, D) of any lengths, float64 (Q, N)."""
@@ -92,13 +90,10 @@ def frechet_distance(one: Tensor, other: Tensor) -> float:
     return max(float(apart @ apart + np.square(first).sum() + np.square(second).sum() - 2.0 * roots.sum()), 0.0)
 
 
-# Linear probes (Section 4.1 of the paper) -----------------------------------------------------------------------------
-
-
 def linear_probe(
     train: Tensor, labels: Tensor, val: Tensor, val_labels: Tensor, test: Tensor, *, balanced: bool = False
 ) -> Tensor:
-    """Classes (N,) of `test` by logistic regression on standardised features, whose penalty `val` chooses.
+    """Classes (N,) of `test` by logistic regression on standardised features, whose penalty `val` chooses (Sec. 4.1).
 
     Features are (M, D), (K, D) and (N, D), labels int64 (M,) and (K,); `balanced` classes weigh alike.
     """

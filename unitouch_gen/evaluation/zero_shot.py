@@ -50,10 +50,10 @@ class ZeroShotTouchClassifier:
 
     Args:
         model: With touch and text.
-        processor: Of both; that of the model's folder if left out.
+        processor: Of both.
 
     Raises:
-        InvalidInputError: If there is no processor with a tokenizer.
+        InvalidInputError: If the processor has no tokenizer.
 
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
@@ -64,11 +64,7 @@ class ZeroShotTouchClassifier:
         ['brick', 'grass']
     """
 
-    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor | None = None):
-        if processor is None:
-            if model.source is None:
-                raise InvalidInputError("`processor` is None, and the model has no folder to read one from; pass one.")
-            processor = UniTouchProcessor.from_pretrained(model.source)
+    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor):
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
         self.model, self.processor = model, processor
@@ -113,14 +109,9 @@ class ZeroShotTouchClassifier:
             labels, template, top: See `__call__`.
             unknown: The second output of `UniTouchModel.encode_touches`: why each is out of distribution, or `None`.
         """
-        shares = (self.scores(features, modality, labels, template) / self.model.config.temperature).softmax(dim=1)
+        texts = [(template or PROMPTS[modality]).format(label) for label in labels]
+        cosines = F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
+        shares = (cosines / self.model.config.temperature).softmax(dim=1)
         best = shares.topk(min(top or len(labels), len(labels)))
         rows = zip(best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True)
         return [Named({labels[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]
-
-    def scores(
-        self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
-    ) -> Tensor:
-        """Cosines of embeddings with the labels in words, (B, labels); see `name` for the arguments."""
-        texts = [(template or PROMPTS[modality]).format(label) for label in labels]
-        return F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
