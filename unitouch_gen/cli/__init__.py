@@ -1,7 +1,4 @@
-"""`unitouch-gen ...`: a thin layer over the pipelines. Each command imports what it needs when it runs.
-
-A mistake of the user prints one line on standard error and exits with 2.
-"""
+"""`unitouch-gen ...`: a thin layer over the pipelines. Each command imports what it needs when it runs."""
 
 import sys
 from typing import Annotated

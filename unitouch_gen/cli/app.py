@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, kind_of, load_pipeline, take_one_thread
+from unitouch_gen.cli.loading import CLASSES, kind_of, load_pipeline
 from unitouch_gen.errors import InvalidInputError, needed
 
 
@@ -33,8 +33,6 @@ def app(
     with tempfile.TemporaryDirectory(prefix="unitouch-") as folder:
         os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
         needed("gradio", "app")
-        if not model:
-            take_one_thread()  # the page names materials outside of pipelines' calls
         from unitouch_gen.cli.page import launch
 
         shared: Any = {"dtype": dtype, "device": device}

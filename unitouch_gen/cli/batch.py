@@ -1,7 +1,4 @@
-"""`unitouch-gen batch`: a picture of every line of a table, or every file of a folder, over accelerate's processes.
-
-A picture that is there is not made again: the same command goes on where one was killed, and tries anew what failed.
-"""
+"""`unitouch-gen batch`: a picture of every line of a table, or every file of a folder, over accelerate's processes."""
 
 import inspect
 import json

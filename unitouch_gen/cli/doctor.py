@@ -3,7 +3,7 @@
 import platform
 import re
 import time
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import distributions, requires
 
 from typer import echo
 
@@ -46,10 +46,6 @@ def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[s
 def packages() -> list[list[str]]:
     """Names and versions of what the package asks for, that of its extras for users too."""
     needs = [need for need in requires("unitouch_gen") or [] if not re.search("extra == .(test|lint|docs)", need)]
-    rows = []
-    for name in dict.fromkeys(re.split(r"[^\w-]", need)[0] for need in needs):
-        try:
-            rows.append([name, version(name)])
-        except PackageNotFoundError:
-            rows.append([name, "missing"])
-    return rows
+    known = {one.name.lower().replace("_", "-"): one.version for one in distributions()}
+    names = dict.fromkeys(re.split(r"[^\w-]", need)[0] for need in needs)
+    return [[name, known.get(name.lower().replace("_", "-"), "missing")] for name in names]

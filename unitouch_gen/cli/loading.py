@@ -97,6 +97,7 @@ def load_pipeline(
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
+    take_one_thread(model)
     if model is None:
         pipe: Any = tiny(name, dtype=weights_dtype)
     else:
@@ -117,8 +118,7 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
-    if model is None:
-        take_one_thread()
+    take_one_thread(model)
     folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
         joint, processor = folder / "unitouch", folder / "processor"
@@ -126,15 +126,15 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 
 
-def take_one_thread() -> None:
-    """Sets one thread for built-in networks that run outside of a pipeline's call, which does so itself.
+def take_one_thread(model: str | None) -> None:
+    """Sets one thread for built-in networks, also outside of a pipeline's call, which does so itself.
 
     They are so small that more threads save a tenth of the time on an idle machine. On a busy one, threads wait for
     each other in every layer and take forty times as long.
     """
     import torch
 
-    if "OMP_NUM_THREADS" not in os.environ:
+    if model is None and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
 
 

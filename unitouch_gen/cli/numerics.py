@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from typer import Exit, Option, echo
 
-from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline, take_one_thread
+from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, check_output, print_table
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
 
@@ -60,8 +60,6 @@ def work_precision(
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
         name = check_choice("--pipeline", pipeline, DRAWING)
-        if model is None:
-            take_one_thread()
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
         student = None
         if lora is not None and "turbo" in names:
