@@ -13,6 +13,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
+from unitouch_gen.files import check_file, files_below, read_table
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
@@ -35,7 +36,9 @@ def batch(
     Example: unitouch-gen batch touches/ -o pictures/
     """
     check_choice("--pipeline", pipeline, DRAWING)
-    rows = in_folder(source, pipeline, output) if source.is_dir() else in_table(source)
+    if not source.is_dir():
+        check_file("source", source, "a .csv file")
+    rows = in_folder(source, pipeline, output) if source.is_dir() else read_table(source)
     import torch
     from accelerate import PartialState
     from accelerate.utils import gather_object
@@ -47,7 +50,8 @@ def batch(
     shared, known = options.call_arguments(context, kind), inspect.signature(kind.__call__).parameters
     columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
     folder = source if source.is_dir() else source.parent
-    pictures = pictures_of([{"seed": str(seed), **row} for row in rows], columns, folder, output, shared)
+    rows = [{"seed": str(seed), **{column: cell for column, cell in row.items() if cell}} for row in rows]
+    pictures = pictures_of(rows, columns, folder, output, shared)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
     if manifest.exists() and not (lines := manifest.read_bytes()).endswith(b"\n"):  # of a disk that was full
@@ -81,22 +85,12 @@ def batch(
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
     """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
-    from unitouch_gen.files import files_below
-
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
     files = files_in(folder, paths, columns)
     places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
     return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
-
-
-def in_table(file: Path) -> list[dict[str, str]]:
-    """The columns of every line of a table with a header; blank cells are left out."""
-    from unitouch_gen.files import check_file, read_table
-
-    check_file("source", file, "a .csv file")
-    return [{column: cell for column, cell in row.items() if cell} for row in read_table(file)]
 
 
 def pictures_of(

@@ -10,6 +10,8 @@ from typer import echo
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import DRAWING, INPUTS, device_of, kind_of, load_pipeline
+from unitouch_gen.examples import example
+from unitouch_gen.weights import FAMILY
 
 
 def doctor(model: options.Model = None, dtype: options.Dtype = None, device: options.Device = "auto") -> None:
@@ -17,8 +19,6 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
 
     Example: unitouch-gen doctor
     """
-    from unitouch_gen.weights import FAMILY
-
     costs = [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else DRAWING)]
     options.print_table(["package", "installed"], packages())
     echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
@@ -29,8 +29,6 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
 def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[str]:
     """Name of a pipeline, seconds of a picture after the first, and bytes of the weights that it has read."""
     import torch
-
-    from unitouch_gen.examples import example
 
     pipe = load_pipeline(kind, model=model, dtype=dtype, device=device)
     inputs = {modality: example("brick", modality) for modality in INPUTS[kind]}

@@ -14,6 +14,7 @@ from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import write_file
 
 TABLES = {
     "material": "Material of touches (Table 2): accuracy, %",
@@ -180,8 +181,6 @@ def figures_of(
 
 def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None) -> None:
     """Prints a table, and writes NAME.json and NAME.md."""
-    from unitouch_gen.files import write_file
-
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
     scale, digits = (1, 2) if name in GENERATED else (100, 1)
 

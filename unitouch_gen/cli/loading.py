@@ -10,6 +10,9 @@ from typing import Any
 
 from unitouch_gen.cli.options import note
 from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.examples import example
+from unitouch_gen.files import check_file, class_name, is_hidden, local_folder, natural, read_settings, reading
+from unitouch_gen.weights import JOINT
 
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
@@ -44,9 +47,6 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
     A word is the path of a file, of a folder, a pattern such as "touches/**/*.png", or "example:brick". Of folders and
     patterns, what is hidden or has another suffix is left out. `name` is the argument, for the messages.
     """
-    from unitouch_gen.examples import example
-    from unitouch_gen.files import check_file, natural
-
     found: list[Path] = []
     for word in words:
         if word.startswith("example:"):
@@ -69,8 +69,6 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
 
 def files_in(folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:
     """The files with some suffixes among paths in a folder; says how many files are left out."""
-    from unitouch_gen.files import is_hidden
-
     files = [path for path in paths if os.path.isfile(path)]
     kept = [file for file in files if file.suffix.lower() in suffixes and not is_hidden(file.relative_to(folder))]
     if kept and len(kept) < len(files):
@@ -90,7 +88,6 @@ def load_pipeline(
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
-    from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
     diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # what diffusers logs as an error it raises as well
@@ -113,9 +110,7 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     place = device_of(device)
     import transformers.utils.logging
 
-    from unitouch_gen.files import reading
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-    from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
     take_one_thread(model)
@@ -140,8 +135,6 @@ def take_one_thread(model: str | None) -> None:
 
 def folder_of(model: str) -> Path:
     """The folder of a model; a repository is fetched first. A name without an owner is taken for a mistyped folder."""
-    from unitouch_gen.files import local_folder
-
     if not os.path.isdir(model) and model.count("/") != 1:
         raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
     return local_folder("--model", model)
@@ -149,8 +142,6 @@ def folder_of(model: str) -> Path:
 
 def kind_of(model: str, kinds: Sequence[str] = DRAWING) -> str:
     """The name of a saved pipeline, which has to be one of some kinds among `CLASSES`."""
-    from unitouch_gen.files import class_name, read_settings
-
     name = class_name(read_settings("--model", folder_of(model) / "model_index.json"))
     known = {CLASSES[kind]: kind for kind in kinds}
     if name not in known:

@@ -9,8 +9,10 @@ from typing import Annotated, Any
 from typer import Exit, Option, echo
 
 from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
-from unitouch_gen.cli.options import Guidance, Model, check_output, print_table
-from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
+from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, did_you_mean
+from unitouch_gen.files import reading
+from unitouch_gen.weights import FAMILY
 
 
 def work_precision(
@@ -33,10 +35,8 @@ def work_precision(
     """
     from tqdm import tqdm
 
-    from unitouch_gen.files import reading
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
-    from unitouch_gen.weights import FAMILY
 
     if (problem is None) == (pipeline is None):
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
@@ -48,8 +48,9 @@ def work_precision(
         lora = built_in
     left_out = {"turbo": lora is None, "default": pipeline is None}
     known = [name for name in wp.NAMES if not left_out.get(name)]
-    names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
-    counts, errors = numbers_of("--steps", steps, int, 1, 1000), numbers_of("--tolerances", tolerances, float, 1e-5, 1)
+    names = dict.fromkeys(by_comma(solvers) or known)
+    counts = [check_integer("--steps", value_of(word), 1, 1000) for word in steps.split(",")]
+    errors = [check_number("--tolerances", value_of(word), 1e-5, 1.0) for word in tolerances.split(",")]
     points: list[dict[str, Any]] = []
     for name in names:
         kind, values = ("tolerance", errors) if name == "adaptive" else ("steps", counts)
@@ -83,17 +84,6 @@ def work_precision(
         if row["failures"]:
             echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")
     echo(f"Chart and results are in {output.resolve()}")
-
-
-def numbers_of(option: str, words: str, kind: type, low: float, high: float) -> list[Any]:
-    """Numbers with commas between them, such as "20,50,100"."""
-    try:
-        numbers = [kind(word) for word in words.split(",")]
-    except ValueError as error:
-        raise InvalidInputError(f"`{option}` is {words!r}; write numbers with commas between them.") from error
-    for number in numbers:
-        check_number(option, number, low, high)
-    return numbers
 
 
 def stability(

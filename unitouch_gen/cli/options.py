@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from typer import Argument, Context, Option
 
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import check_writable
 
 SETTABLE = (
     "bridge", "eta", "guidance_scale", "height", "init_strength", "keep_colours", "layout", "max_evaluations", "mix",
@@ -76,8 +77,6 @@ def by_comma(words: str | None) -> list[str] | None:
 
 def check_output(files: Sequence[Path], overwrite: bool) -> None:
     """Refuses to replace files that are there, if not asked to, and places that cannot be written to."""
-    from unitouch_gen.files import check_writable
-
     for file in filter(os.path.lexists, () if overwrite else files):
         raise InvalidInputError(f"`--output` would replace {str(file)!r}; name another place, or pass `--overwrite`.")
     check_writable("--output", files[0])

@@ -17,6 +17,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import files_of, load_pipeline
 from unitouch_gen.cli.options import SEVERAL
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import replacing
 
 # Commands -------------------------------------------------------------------------------------------------------------
 
@@ -175,8 +176,6 @@ def draw(pipe: Any, pictures: Sequence[Picture]) -> Any:
 
 def save(image: Any, file: Path) -> None:
     """Writes a PIL image whole, or leaves what was there."""
-    from unitouch_gen.files import replacing
-
     with replacing("--output", file) as partial:
         image.save(partial)
 
