@@ -1,9 +1,7 @@
 """The random numbers of objects and contacts, drawn from their identity alone.
 
-A touch tells the material as a real one does: four of five contacts are at a face that fills the gel, and every
-object wears its own material's relief. A contact is named by (material, object, contact). Its numbers
-come from `numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, on
-another day and another machine.
+A contact is named by (material, object, contact). Its numbers come from `numpy.random.SeedSequence` over that name and
+the world's seed, so a scene is the same alone, in a batch, on another day and another machine.
 
 Objects of the splits "val" and "test" are held out and in the ranges of those to train on; those of "beyond" have
 lengths and heights outside of these ranges.
@@ -30,7 +28,7 @@ SHAPES: dict[str, float] = {
     "flat": 0.80, "ball": 0.03, "rod": 0.04, "blob": 0.04, "edge": 0.03, "corner": 0.02, "box": 0.02, "coin": 0.01,
     "ring": 0.01,
 }  # fmt: skip
-"""Shapes that contacts are at, and how often."""
+"""Shapes that contacts are at, and how often: four of five are at a face that fills the gel, as real touches are."""
 
 FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600, "beyond": 800}
 """The first object of each split, within each thousand."""

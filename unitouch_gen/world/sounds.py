@@ -1,8 +1,7 @@
 """Impact sounds by modal synthesis, in closed form, and the rooms and microphones that they are heard through.
 
-Each mode is the impulse response of q'' + 2 a q' + w^2 q = delta(t), evaluated exactly: ringing, critically damped and
-over-damped modes come from one formula without a branch that loses digits, and modes at or above the Nyquist
-frequency fade out instead of folding back.
+Each mode is the impulse response of q'' + 2 a q' + w^2 q = delta(t). Modes at or above the Nyquist frequency fade out
+instead of folding back.
 """
 
 import math
