@@ -187,7 +187,7 @@ def pass_odd_arguments(pipes: dict[str, Any], count: int) -> None:
 COMMANDS = {
     "touch-to-image": "in/a.png -o out", "stylize": "in/a.png in/a.png -o out", "x-to-touch": "--text brick -o out",
     "batch": "table.csv -o out", "classify": "in/a.png --labels wood,glass",
-    "convert unitouch": "--touch in/a.png -o out", "data check": "in", "stability": "--list",
+    "convert unitouch": "--touch in/a.png -o out", "data check": "in", "stability": "--only none",
     "distill": "--model in -o out",
 }  # fmt: skip
 

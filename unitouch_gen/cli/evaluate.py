@@ -89,9 +89,6 @@ def evaluate(
         echo(f"The tables are in {output.resolve()}")
 
 
-# What can be measured -------------------------------------------------------------------------------------------------
-
-
 def asked_for(table: str, model: str | None) -> list[str]:
     """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
     kinds = [*PIPELINES.values()] if model is None else []
@@ -131,9 +128,6 @@ def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: 
         least = each * len({record.labels.get("material") for record in parts["test"].records}) + 2
         if name in GENERATED and len(parts["test"]) < least:
             raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
-
-
-# Figures --------------------------------------------------------------------------------------------------------------
 
 
 def figures_of(

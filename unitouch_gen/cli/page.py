@@ -69,9 +69,6 @@ def tab(pipe: Any, kind: str) -> None:
     button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
 
 
-# Fields ---------------------------------------------------------------------------------------------------------------
-
-
 def touch_fields(pipe: Any) -> Fields:
     sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.config.sensors)]
     return {

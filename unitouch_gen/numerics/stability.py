@@ -55,9 +55,6 @@ def error(
     return 0.0 if exact is None else relative_rms(found, exact).max().item()
 
 
-# Stiff problems -------------------------------------------------------------------------------------------------------
-
-
 def stiff_cases(tolerance: float) -> Iterator[Case]:
     """Adaptive steps on problems of which the exact flow is known."""
     for problem in (each for each in PROBLEMS.values() if each.stiff):
@@ -80,9 +77,6 @@ def within(problem: Problem, tolerance: float) -> float:
     ends = [2 * last, last]
     levels = [(sigma, problem.denoise(x, sigma)) for sigma, x in zip(ends, problem.path(noise, ends), strict=True)]
     return tolerance + relative_rms(denoised_at_zero(levels), problem.solution(noise)).max().item()
-
-
-# Pipelines ------------------------------------------------------------------------------------------------------------
 
 
 def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Case]:

@@ -46,9 +46,6 @@ NAMES = (*SOLVERS, "adaptive", "default", "turbo", *BASELINES)
 """Solvers that can be measured: "default" is a pipeline's own scheduler, "turbo" a distilled network."""
 
 
-# What is measured -----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Target:
     """A network with its conditions bound, N noises to start from, and where the exact flow ends from them."""
@@ -131,9 +128,6 @@ def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor
     return {name: found[name] for name in modalities}
 
 
-# Measuring ------------------------------------------------------------------------------------------------------------
-
-
 def measure(
     target: Target, solver: str, steps: int | None = None, tolerance: float | None = None, repeats: int = 3
 ) -> Row:
@@ -184,9 +178,6 @@ def pareto_front(rows: Sequence[Row], cost: str) -> list[Row]:
 def amount(row: Row) -> str:
     """ "20 steps" or "tolerance 0.01"."""
     return f"tolerance {row['tolerance']:g}" if row["steps"] is None else f"{row['steps']} steps"
-
-
-# Chart ----------------------------------------------------------------------------------------------------------------
 
 
 def draw_chart(target: Target, rows: Sequence[Row]) -> Figure:
