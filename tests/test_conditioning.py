@@ -1,109 +1,78 @@
-"""From an embedding to the class labels of an unCLIP UNet, against diffusers' own pipeline and closed forms."""
+"""From an embedding to the class labels of an unCLIP UNet and to stored images, against diffusers and closed forms."""
+
+from pathlib import Path
 
 import pytest
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
-from diffusers.models.embeddings import get_timestep_embedding
+from diffusers import DDPMScheduler
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from torch.nn.functional import normalize
 
-from unitouch_gen.conditioning import match_norm, noise_embeddings
+from tests.helpers.calls import diffusers_pipeline, seeded
+from tests.helpers.components import D, make_components
+from unitouch_gen.conditioning import EmbeddingBank, bridge_nearest, match_norm, noise_embeddings
 
-D = 16
-
-
-@pytest.fixture
-def scheduler() -> DDPMScheduler:
-    return DDPMScheduler(beta_schedule="squaredcos_cap_v2")
-
-
-@pytest.fixture
-def normalizer() -> StableUnCLIPImageNormalizer:
-    torch.manual_seed(0)
-    normalizer = StableUnCLIPImageNormalizer(embedding_dim=D).requires_grad_(False)
-    normalizer.mean.normal_()
-    normalizer.std.uniform_(0.5, 1.5)
-    return normalizer
+BANK = normalize(torch.randn(40, D, generator=seeded()), dim=1)
+EMBEDS = 5.0 * torch.randn(5, D, generator=seeded(1))
+NOISE = torch.randn(5, D, generator=seeded(2))
 
 
-@pytest.fixture
-def embeds() -> torch.Tensor:
-    return torch.randn(5, D, generator=torch.Generator().manual_seed(1))
-
-
-# Norm -----------------------------------------------------------------------------------------------------------------
-
-
-def test_every_embedding_gets_the_norm_and_keeps_its_direction(embeds):
-    unit = embeds / embeds.norm(dim=-1, keepdim=True)
-    for scale in (1e-12, 1.0, 1e12):
-        torch.testing.assert_close(match_norm(scale * embeds.view(5, 1, D), 20.0), 20.0 * unit.view(5, 1, D))
-
-
-def test_the_zero_vector_stays_zero(embeds):
-    embeds[2] = 0.0
-    matched = match_norm(embeds, 20.0)
-    assert not matched[2].any() and torch.isfinite(matched).all()
+def test_every_embedding_gets_the_norm_and_keeps_its_direction_and_zero_stays_zero():
+    unit = normalize(EMBEDS, dim=1)
+    for scale in (1e-12, 1.0, 1e12, 0.0):
+        expected = (20.0 if scale else 0.0) * unit.view(5, 1, D)
+        torch.testing.assert_close(match_norm(scale * EMBEDS.view(5, 1, D), 20.0), expected)
 
 
 # Noising --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def reference(normalizer, scheduler) -> StableUnCLIPImg2ImgPipeline:
-    """diffusers' pipeline; of its components only the normaliser and the noising scheduler matter here."""
-    unet = UNet2DConditionModel(
-        sample_size=8, block_out_channels=(4,), layers_per_block=1, down_block_types=("DownBlock2D",),
-        up_block_types=("UpBlock2D",), mid_block_type=None, norm_num_groups=2, cross_attention_dim=4,
-    )  # fmt: skip
-    vae = AutoencoderKL(block_out_channels=(4,), norm_num_groups=2)
-    return StableUnCLIPImg2ImgPipeline(
-        None, None, normalizer, scheduler, None, None, unet, DDIMScheduler(steps_offset=1), vae
-    )
-
-
-def test_noising_is_that_of_diffusers(reference, normalizer, scheduler, embeds):
-    noise = torch.randn(5, D, generator=torch.Generator().manual_seed(2))
-    for level in (0, 1, 250, 500, 999):
-        expected = reference.noise_image_embeddings(embeds, noise_level=level, noise=noise)
-        got = noise_embeddings(embeds, torch.full((5,), level), noise, normalizer, scheduler)
-        torch.testing.assert_close(got, expected, atol=1e-6, rtol=0)
-
-
-def test_levels_are_each_embeddings_own(normalizer, scheduler, embeds):
-    noise, levels = torch.randn(5, D), torch.tensor([0, 10, 250, 500, 999])
-    together = noise_embeddings(embeds, levels, noise, normalizer, scheduler)
-    rows = [slice(i, i + 1) for i in range(5)]
-    alone = [noise_embeddings(embeds[i], levels[i], noise[i], normalizer, scheduler) for i in rows]
-    torch.testing.assert_close(together, torch.cat(alone))
+def test_noising_each_at_its_own_level_is_that_of_diffusers():
+    pipe, levels = diffusers_pipeline(make_components()), torch.tensor([0, 1, 250, 500, 999])
+    found = noise_embeddings(EMBEDS, levels, NOISE, pipe.image_normalizer, pipe.image_noising_scheduler)
+    each = [pipe.noise_image_embeddings(EMBEDS, noise_level=level, noise=NOISE) for level in levels.tolist()]
+    expected = torch.stack([labels[row] for row, labels in enumerate(each)])
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("level", "signal", "sigma"), [(50, 0.996, 0.091), (250, 0.920, 0.393), (500, 0.702, 0.713)])
-def test_signal_and_noise_have_the_shares_of_the_schedule(scheduler, embeds, level, signal, sigma):
+def test_signal_and_noise_have_the_shares_of_the_schedule(level, signal, sigma):
     """With a plain normaliser c = sqrt(abar) e + sqrt(1 - abar) n; the shares are those of SD 2.1 unCLIP."""
     plain = StableUnCLIPImageNormalizer(embedding_dim=D).requires_grad_(False)
-    noise = torch.randn(5, D)
-    got = noise_embeddings(embeds, torch.full((5,), level), noise, plain, scheduler)[:, :D]
-    torch.testing.assert_close(got, signal * embeds + sigma * noise, atol=5e-3, rtol=0)
-
-
-def test_the_mean_embedding_without_noise_stays_the_mean(normalizer, scheduler):
-    mean = normalizer.mean.detach()
-    got = noise_embeddings(mean, torch.tensor([700]), torch.zeros(1, D), normalizer, scheduler)
-    torch.testing.assert_close(got[:, :D], mean)
-
-
-def test_the_second_half_is_the_sinusoid_of_the_level(normalizer, scheduler, embeds):
-    levels = torch.tensor([0, 10, 250, 500, 999])
-    got = noise_embeddings(embeds, levels, torch.randn(5, D), normalizer, scheduler)
-    torch.testing.assert_close(
-        got[:, D:], get_timestep_embedding(levels, D, flip_sin_to_cos=True, downscale_freq_shift=0)
-    )
-    torch.testing.assert_close(got[:, D], levels.float().cos())  # the cosine of the highest frequency comes first
-
-
-def test_labels_keep_the_dtype_of_the_embeddings_and_inputs_stay_as_they_were(normalizer, scheduler, embeds):
+    scheduler, unit = DDPMScheduler(beta_schedule="squaredcos_cap_v2"), EMBEDS / 5.0
     for dtype in (torch.float16, torch.bfloat16, torch.float64, torch.float32):
-        inputs = (embeds.to(dtype), torch.full((5,), 100), torch.randn(5, D, dtype=dtype), normalizer.mean)
-        kept = [values.clone() for values in inputs]
-        assert noise_embeddings(*inputs[:3], normalizer, scheduler).dtype == dtype
-        assert all(torch.equal(one, other) for one, other in zip(inputs, kept, strict=True))
+        inputs = (unit.to(dtype), torch.full((5,), level), NOISE.to(dtype), plain, scheduler)
+        found = noise_embeddings(*inputs)
+        assert found.dtype == dtype
+    torch.testing.assert_close(found[:, :D], signal * unit + sigma * NOISE, atol=5e-3, rtol=0)
+
+
+# The bridge -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "temperature", "share"), [(10, 0.05, 0.5), (5, 0.1, 0.0), (1, 0.1, 1.0), (50, 0.1, 0.5)]
+)
+def test_the_bridge_is_the_formula_of_the_papers_release(neighbours, temperature, share):
+    """Also with more neighbours than there are."""
+    found = bridge_nearest(EMBEDS, BANK, neighbours=neighbours, temperature=temperature, share=share)
+    for row, embed in zip(found, EMBEDS, strict=True):
+        unit = embed / embed.norm()
+        nearest = sorted(range(40), key=lambda n: -float(unit @ BANK[n]))[:neighbours]
+        weights = torch.softmax(torch.stack([unit @ BANK[n] for n in nearest]) / temperature, dim=0)
+        prototype = sum(w * BANK[n] for w, n in zip(weights, nearest, strict=True))
+        moved = (1 - share) * unit + share * prototype / prototype.norm()
+        torch.testing.assert_close(row, embed.norm() * moved / moved.norm())
+
+
+def test_what_is_in_the_bank_stays_where_it_is_and_so_does_zero():
+    for embeds in (3.0 * BANK, torch.zeros(2, D)):
+        found = bridge_nearest(embeds, BANK, neighbours=10, temperature=1e-3, share=1.0)
+        torch.testing.assert_close(found, embeds, atol=1e-4, rtol=0.0)
+
+
+def test_a_bank_bridges_as_it_is_configured_and_as_it_was_saved(tmp_path: Path):
+    held = EmbeddingBank.of(7.0 * BANK, neighbours=3, temperature=0.2, share=0.7)
+    torch.testing.assert_close(held.bridge(EMBEDS), bridge_nearest(EMBEDS, BANK, 3, 0.2, 0.7))
+    held.save_pretrained(tmp_path)
+    assert torch.equal(EmbeddingBank.from_pretrained(tmp_path).bridge(EMBEDS), held.bridge(EMBEDS))
