@@ -1,6 +1,5 @@
 """Files and folders are whole or not there, and what cannot be read or written is one error that names the argument."""
 
-import json
 import subprocess
 import sys
 import textwrap
@@ -10,16 +9,10 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from yaml import safe_load
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import (
-    as_path,
-    check_file,
     check_writable,
-    local_folder,
-    natural,
-    read_settings,
     read_table,
     reading,
     replacing,
@@ -118,38 +111,6 @@ def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_no_path_file_or_folder():
-    files = ("missing.png", "https://example.org/a.png", ".", "a" * 5000)
-    folders = ("./missing", "a/b/c", "no repository", __file__)
-    with pytest.raises(InvalidTypeError, match=r"^`image`"):
-        as_path("image", 3)
-    image = partial(check_file, what="an image file")
-    for check, places in ((as_path, ("", "a\0b")), (image, files), (local_folder, folders)):
-        for place in places:
-            with pytest.raises(InvalidInputError, match=r"^`image`"):
-                check("image", place)
-
-
-def test_numbers_in_names_count_as_numbers():
-    assert sorted(["10.png", "2.png", "a1", "a10", "a9"], key=natural) == ["2.png", "10.png", "a1", "a9", "a10"]
-
-
-def test_settings_that_cannot_be_read(tmp_path):
-    yaml = ("a: [", "- 1", "a: !!python/object/apply:os.system ['true']")
-    for parse, texts in ((json.loads, ("{", "[1]", "\xff")), (safe_load, yaml)):
-        for text in texts:
-            (tmp_path / "a").write_text(text, encoding="latin-1")
-            with pytest.raises(InvalidInputError, match="`recipe` names"):
-                read_settings("recipe", tmp_path / "a", parse)
-
-
-def test_settings_are_read(tmp_path):
-    write_file("x", tmp_path / "a.json", json.dumps({"a": [1, 2]}))
-    write_file("x", tmp_path / "a.yaml", "a: [1, 2]")
-    by_yaml = read_settings("x", tmp_path / "a.yaml", safe_load)
-    assert read_settings("x", tmp_path / "a.json") == by_yaml == {"a": [1, 2]}
 
 
 def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_stays(tmp_path):

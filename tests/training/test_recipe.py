@@ -117,6 +117,7 @@ def test_a_recipe_that_is_none_is_refused(tmp_path: Path) -> None:
         b"data: {image_size: 1}": "`trainer` is missing in the recipe",
         b"trainer: 3": "`trainer` is 3; it has to be a valid dictionary",
         b"trainer: {steps: [1": "cannot be read",
+        b"trainer: !!python/object/apply:os.system ['true']": "cannot be read",
         b"data: {base: taste}": r"`data\.base` names 'taste', which does not exist",
     }.items():
         (tmp_path / "mine.yaml").write_bytes(content)
