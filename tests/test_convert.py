@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from transformers import CLIPTokenizer
 
 from tests.helpers.imagebind import ImageBind
-from tests.helpers.published_files import features_of, inputs_of, published, small
+from tests.helpers.published import features_of, inputs_of, published, sizes
 from unitouch_gen.convert import convert_published, open_checkpoint, read_published
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
@@ -27,24 +27,24 @@ from unitouch_gen.training.tokenizer import train_tokenizer
 
 
 @pytest.fixture(scope="module")
-def small_files(tmp_path_factory) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
+def both(tmp_path_factory) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
     """The files, and the networks in them by modality."""
-    return published(tmp_path_factory.mktemp("published"), small())
+    return published(tmp_path_factory.mktemp("published"), sizes())
 
 
 @pytest.fixture(scope="module")
-def files(small_files) -> dict[str, Path]:
-    return small_files[0]
+def files(both) -> dict[str, Path]:
+    return both[0]
 
 
 @pytest.fixture(scope="module")
-def networks(small_files) -> dict[str, torch.nn.Module]:
-    return small_files[1]
+def networks(both) -> dict[str, torch.nn.Module]:
+    return both[1]
 
 
 @pytest.fixture(scope="module")
 def model(files) -> UniTouchModel:
-    return read_published(**files, config=small())
+    return read_published(**files, config=sizes())
 
 
 def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> torch.Tensor:
@@ -62,7 +62,7 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_embeddings_are_those_of_the_published_networks(networks, model, modality):
-    values = inputs_of(small())[modality]
+    values = inputs_of(sizes())[modality]
     features = expected(networks[modality], modality, values)
     found = features_of(model, modality, values)
     assert relative(found, F.normalize(features, dim=-1) if modality == "audio" else features) <= 1e-6
@@ -80,15 +80,15 @@ def test_clips_of_a_sound_are_averaged_as_imagebind_does(networks, model):
 
 def test_one_file_brings_its_encoders_alone_in_the_dtype_asked_for_and_is_not_changed(files):
     before = files["touch"].read_bytes()
-    touch = read_published(touch=files["touch"], config=small(), dtype=torch.bfloat16)
+    touch = read_published(touch=files["touch"], config=sizes(), dtype=torch.bfloat16)
     assert touch.loaded_modalities == ("touch",) and len(touch.sensor_bank) == 0
     assert {weight.dtype for weight in touch.parameters()} == {torch.bfloat16} == {touch.dtype}
-    own = read_published(touch=files["touch"], config=small())
+    own = read_published(touch=files["touch"], config=sizes())
     with torch.no_grad():
         for weight in own.parameters():
             weight.zero_()
     assert files["touch"].read_bytes() == before
-    others = read_published(imagebind=files["imagebind"], config=small())
+    others = read_published(imagebind=files["imagebind"], config=sizes())
     assert others.loaded_modalities == ("image", "text", "audio")
 
 
@@ -104,25 +104,25 @@ HEAD = "modality_heads.touch.2.weight"
     [
         (edit(HEAD, lambda head: head.fill_(math.nan)), "heads.touch.2.weight` holds .* values that are NaN"),
         (lambda state: state.pop("modality_trunks.touch.blocks.0.attn.bias_k"), "blocks.0.attn.bias_k is missing"),
-        (edit(HEAD, lambda head: head[:, :-1]), r"heads.touch.2.weight is \(32, 63\) instead of \(32, 64\)"),
+        (edit(HEAD, lambda head: head[:, :-1]), r"heads.touch.2.weight is \(16, 31\) instead of \(16, 32\)"),
         (edit(HEAD, lambda head: head.long()), "heads.touch.2.weight is missing"),
     ],
 )
 def test_files_of_another_network_change_nothing(tmp_path, change, words):
-    state = ImageBind(small(), ("touch",)).state_dict()
+    state = ImageBind(sizes(), ("touch",)).state_dict()
     change(state)
     torch.save(state, tmp_path / "edited.ckpt")
     with pytest.raises(InvalidInputError, match=words):
-        convert_published(tmp_path / "model", touch=tmp_path / "edited.ckpt", config=small(), dtype=torch.float16)
+        convert_published(tmp_path / "model", touch=tmp_path / "edited.ckpt", config=sizes(), dtype=torch.float16)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.ckpt"]
 
 
 def test_files_that_are_exchanged_or_left_out_are_told(files):
     for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
         with pytest.raises(InvalidInputError, match=r"`touch` is for UniTouch's last_new.ckpt"):
-            read_published(**{name: files[other]}, config=small())
+            read_published(**{name: files[other]}, config=sizes())
     with pytest.raises(InvalidInputError, match=r"Pass `touch`, `imagebind` or both"):
-        read_published(config=small())
+        read_published(config=sizes())
     with pytest.raises(InvalidInputError, match="`config` names sensors"):
         read_published(touch=files["touch"], config=UniTouchConfig(sensors=["digit"]))
 
@@ -214,20 +214,20 @@ def tokenizer_folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def folder(files, tmp_path_factory, tokenizer_folder) -> Path:
     folder = tmp_path_factory.mktemp("converted")
-    convert_published(folder, **files, config=small(), tokenizer=tokenizer_folder)
+    convert_published(folder, **files, config=sizes(), tokenizer=tokenizer_folder)
     return folder
 
 
 @torch.no_grad()
 def test_the_folder_is_the_model_of_the_files_and_its_processor_fits(model, folder, tokenizer_folder):
     again, processor = UniTouchModel.from_pretrained(folder), UniTouchProcessor.from_pretrained(folder)
-    for modality, values in inputs_of(small()).items():
+    for modality, values in inputs_of(sizes()).items():
         found, wanted = features_of(again, modality, values), features_of(model, modality, values)
         torch.testing.assert_close(found, wanted, rtol=0, atol=0)
     known = CLIPTokenizer.from_pretrained(tokenizer_folder)
     assert processor.tokenizer("rough brick").input_ids == known("rough brick").input_ids
     sound = torch.randn(16_000, generator=torch.Generator().manual_seed(0)).numpy()
-    assert processor.image_size == 28 and again.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 32)
+    assert processor.image_size == 32 and again.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 16)
 
 
 @pytest.mark.parametrize("there", ["a model", "a pipeline", "a file"])
@@ -241,5 +241,5 @@ def test_what_else_is_there_is_not_written_over(files, folder, tmp_path, content
         (output / "config.json").rename(output / "model_index.json")
     before = contents(tmp_path)
     with pytest.raises(InvalidInputError, match="`output`"):
-        convert_published(output, touch=files["touch"], config=small())
+        convert_published(output, touch=files["touch"], config=sizes())
     assert contents(tmp_path) == before

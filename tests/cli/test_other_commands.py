@@ -9,7 +9,7 @@ import torch
 
 from tests.helpers.components import make_components
 from tests.helpers.language import make_language_parts
-from tests.helpers.published_files import published, small
+from tests.helpers.published import published, sizes
 from tests.helpers.touch_llm import files_of as touch_llm_files
 from unitouch_gen import example, weights
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
@@ -36,8 +36,8 @@ def test_classify_says_what_the_library_says(command):
 
 
 def test_published_files_become_a_folder(command, tmp_path):
-    encoders, _ = published(tmp_path, small())
-    small().save_pretrained(tmp_path)
+    encoders, _ = published(tmp_path, sizes())
+    sizes().save_pretrained(tmp_path)
     files = [word for name, file in encoders.items() for word in (f"--{name}", file)]
     words = ("convert", "unitouch", *files, "--config", tmp_path / "config.json", "--dtype", "bfloat16")
     code, out, err = command(*words, "-o", tmp_path / "model")

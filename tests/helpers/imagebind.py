@@ -4,6 +4,7 @@ Girdhar et al., 2023, "ImageBind: One embedding space to bind them all", with Un
 """
 
 import math
+from types import SimpleNamespace
 
 import torch
 import torch.nn.functional as F
@@ -23,32 +24,22 @@ class Block(nn.Module):
         return x + self.mlp["fc2"](F.gelu(self.mlp["fc1"](self.norm_2(x))))
 
 
-class Stem(nn.Module):
-    def __init__(self, proj, norm=None):
-        super().__init__()
-        self.proj, self.norm_layer = proj, norm
-
-
-class Positions(nn.Module):
-    def __init__(self, tokens, width):
-        super().__init__()
-        self.pos_embed = nn.Parameter(torch.randn(1, tokens, width) * 0.1)
-
-
 class Seen(nn.Module):
     """Preprocessor of pictures, touches and spectrograms."""
 
-    def __init__(self, stem, tokens, width):
+    def __init__(self, convolution, grid, width, **norm):
         super().__init__()
         self.cls_token = nn.Parameter(torch.randn(1, 1, width) * 0.1)
-        self.rgbt_stem, self.pos_embedding_helper = stem, Positions(tokens, width)
+        self.rgbt_stem = nn.ModuleDict({"proj": convolution, **norm})
+        position = nn.Parameter(torch.randn(1, math.prod(grid) + 1, width) * 0.1)
+        self.pos_embedding_helper = nn.ParameterDict({"pos_embed": position})
 
     def forward(self, x):
-        x = self.rgbt_stem.proj(x).flatten(2).transpose(1, 2)
-        if self.rgbt_stem.norm_layer is not None:
-            x = self.rgbt_stem.norm_layer(x)
+        x = self.rgbt_stem["proj"](x).flatten(2).transpose(1, 2)
+        if "norm_layer" in self.rgbt_stem:
+            x = self.rgbt_stem["norm_layer"](x)
         x = torch.cat([self.cls_token.expand(len(x), -1, -1), x], dim=1)
-        return x + self.pos_embedding_helper.pos_embed
+        return x + self.pos_embedding_helper["pos_embed"]
 
 
 class Read(nn.Module):
@@ -77,12 +68,6 @@ class Trunk(nn.Module):
         return x.transpose(0, 1)
 
 
-class TextHead(nn.Module):
-    def __init__(self, width, projected):
-        super().__init__()
-        self.proj = nn.Sequential(nn.LayerNorm(width, eps=1e-6), nn.Linear(width, projected, bias=False))
-
-
 class Scale(nn.Module):
     def __init__(self, scale, learned):
         super().__init__()
@@ -96,10 +81,6 @@ class Scale(nn.Module):
         return x * self.log_logit_scale.exp().clamp(max=100)
 
 
-def stem_over_frames(width, patch):
-    return Stem(nn.Sequential(nn.Identity(), nn.Conv3d(3, width, (2, patch, patch), (2, patch, patch), bias=False)))
-
-
 class ImageBind(nn.Module):
     """ImageBind at the sizes of a `UniTouchConfig`, with random weights, larger than at a start so that all matters.
 
@@ -111,51 +92,34 @@ class ImageBind(nn.Module):
 
     def __init__(self, config, modalities=("vision", "text", "audio", "depth"), text_scale=14.0):
         super().__init__()
-        vision, text, audio, touch = (getattr(config, f"{n}_config") for n in ("vision", "text", "audio", "touch"))
-        projected = config.projection_dim
-        grid = (vision.image_size // vision.patch_size) ** 2
-        make = {
-            "vision": lambda: Seen(
-                stem_over_frames(vision.hidden_size, vision.patch_size), grid + 1, vision.hidden_size
-            ),
-            "touch": lambda: Seen(
-                stem_over_frames(touch.hidden_size, touch.patch_size), math.prod(touch.grid) + 1, touch.hidden_size
-            ),
-            "depth": lambda: Seen(stem_over_frames(16, 4), 5, 16),
-            "text": lambda: Read(text.vocab_size, text.max_position_embeddings, text.hidden_size),
-            "audio": lambda: Seen(
-                Stem(
-                    nn.Conv2d(1, audio.hidden_size, audio.patch_size, audio.patch_stride, bias=False),
-                    nn.LayerNorm(audio.hidden_size),
-                ),
-                math.prod(audio.grid) + 1,
-                audio.hidden_size,
-            ),
-        }
-        sizes = {
-            name: (part.hidden_size, part.num_attention_heads, part.num_hidden_layers)
-            for name, part in (("vision", vision), ("text", text), ("audio", audio), ("touch", touch))
-        } | {"depth": (16, 2, 1)}
-        self.modality_preprocessors = nn.ModuleDict({name: make[name]() for name in modalities})
-        self.modality_trunks = nn.ModuleDict(
-            {
-                name: Trunk(*sizes[name], bias_kv=name in ("audio", "touch", "depth"), norm_before=name == "vision")
-                for name in modalities
-            }
-        )
-        self.modality_heads = nn.ModuleDict()
-        self.modality_postprocessors = nn.ModuleDict()
+        parts = {name: getattr(config, f"{name}_config") for name in ("vision", "text", "audio", "touch")}
+        sizes = {"hidden_size": 16, "num_attention_heads": 2, "num_hidden_layers": 1, "image_size": 8, "patch_size": 4}
+        parts["depth"] = SimpleNamespace(**sizes)
+        self.modality_preprocessors, self.modality_trunks = nn.ModuleDict(), nn.ModuleDict()
+        self.modality_heads, self.modality_postprocessors = nn.ModuleDict(), nn.ModuleDict()
         for name in modalities:
-            width = sizes[name][0]
-            self.modality_heads[name] = (
-                TextHead(width, projected)
-                if name == "text"
-                else nn.Sequential(
-                    nn.LayerNorm(width, eps=1e-6), nn.Identity(), nn.Linear(width, projected, bias=False)
-                )
-            )
-            scales = {"text": (text_scale, True), "audio": (20.0, False), "touch": (5.0, False)}
-            after = [nn.Identity(), Scale(*scales[name])] if name in scales else [nn.Identity()]
+            part, width = parts[name], parts[name].hidden_size
+            head = [nn.LayerNorm(width, eps=1e-6), nn.Linear(width, config.projection_dim, bias=False)]
+            after = [nn.Identity()]
+            if name == "text":
+                self.modality_preprocessors[name] = Read(part.vocab_size, part.max_position_embeddings, width)
+                self.modality_heads[name] = nn.ModuleDict({"proj": nn.Sequential(*head)})
+                after.append(Scale(text_scale, learned=True))
+            elif name == "audio":
+                convolution = nn.Conv2d(1, width, part.patch_size, part.patch_stride, bias=False)
+                made = Seen(convolution, part.grid, width, norm_layer=nn.LayerNorm(width))
+                self.modality_preprocessors[name] = made
+                after.append(Scale(20.0, learned=False))
+            else:
+                size = (2, part.patch_size, part.patch_size)
+                convolution = nn.Sequential(nn.Identity(), nn.Conv3d(3, width, size, size, bias=False))
+                grid = part.grid if name == "touch" else (part.image_size // part.patch_size,) * 2
+                self.modality_preprocessors[name] = Seen(convolution, grid, width)
+                after += [Scale(5.0, learned=False)] if name == "touch" else []
+            if name != "text":
+                self.modality_heads[name] = nn.Sequential(head[0], nn.Identity(), head[1])
+            depth, bias_kv = part.num_hidden_layers, name in ("audio", "touch", "depth")
+            self.modality_trunks[name] = Trunk(width, part.num_attention_heads, depth, bias_kv, name == "vision")
             self.modality_postprocessors[name] = nn.Sequential(*after)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
@@ -175,8 +139,7 @@ class ImageBind(nn.Module):
         tokens = self.modality_trunks[name](tokens, mask)
         if name == "text":
             last = tokens[torch.arange(len(x)), x.argmax(dim=1)]  # the end token has the highest id
-            features = self.modality_heads[name].proj(last)
+            features = self.modality_heads[name]["proj"](last)
         else:
-            head = self.modality_heads[name]
-            features = head[2](head[0](tokens[:, 0]))
+            features = self.modality_heads[name](tokens[:, 0])
         return features, self.modality_postprocessors[name](F.normalize(features, dim=-1))

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from transformers import CLIPVisionModelWithProjection
 
 from tests.helpers.calls import Call, quiet, seeded
-from tests.helpers.published_parts import converted, sizes, write_unclip
+from tests.helpers.published import converted, sizes, write_unclip
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline
