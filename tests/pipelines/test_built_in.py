@@ -11,9 +11,8 @@ import unitouch_gen
 from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.small_family import write_small_family
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NotConvergedError
-from unitouch_gen.pipelines.tiny import PIPELINES
-from unitouch_gen.sampling import ReturnCode
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
 
 
 @pytest.fixture(scope="module", params=["touch-to-image", "x-to-touch"])
@@ -39,16 +38,11 @@ def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_
     assert all(torch.equal(*pair) for pair in weights)
 
 
-def test_a_tolerance_is_kept_or_told_of(call):
+def test_a_tolerance_is_kept(call):
     """Against many more steps of another solver."""
     found, reference = call(tolerance=0.1, output_type="latent"), call.latents(solver="dpm++2m", num_inference_steps=30)
     assert (found.images - reference).norm() / reference.norm() < 0.12
     assert found.report.evaluations < 40 and found.report.solver == "adaptive"
-    few = {"tolerance": 1e-3, "max_evaluations": 3, "output_type": "latent"}
-    with pytest.raises(NotConvergedError, match="Stopped after 3 evaluations"):
-        call(**few)
-    output = call(throw=False, **few)
-    assert output.report.codes == [ReturnCode.MAX_EVALUATIONS] and torch.isfinite(output.images).all()
 
 
 def test_diffusers_own_pipeline_makes_the_same_picture():
@@ -80,6 +74,7 @@ def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):
         unitouch_gen.tiny("x-to-touch", family=tmp_path)
     shutil.rmtree(file.parent)
     families = [{"family": family} for family in (tmp_path, 3, "gone")]
+    families += [{"family": tmp_path, "name": name} for name in TURBO]  # without their LoRA weights
     for wrong in (*families, {"name": "touch-to-imag"}, {"dtype": "int8"}):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(wrong))}` "):
             unitouch_gen.tiny(**{"name": "x-to-touch", **wrong})

@@ -171,15 +171,6 @@ def test_a_sample_that_breaks_raises_at_its_step_and_leaves_the_next_call_alone(
     assert torch.equal(call.latents(), expected)
 
 
-@pytest.mark.parametrize("solver", [None, "heun"])
-def test_without_throw_the_other_picture_comes_as_if_alone(call, solver):
-    options = {"num_inference_steps": 4, "output_type": "latent", "solver": solver}
-    whole, output = call(**options), call(throw=False, callback_on_step_end=put(NAN, row=0), **options)
-    assert_close(output.images, whole.images[1:], atol=1e-5, rtol=1e-5)
-    assert output.report.codes == [ReturnCode.NON_FINITE, whole.report.codes[1]]
-    assert output.report.failed_at[0] == 0 and not output.report.success
-
-
 def test_if_all_break_nothing_comes_back_in_the_kind_asked_for(call):
     for kind in ("pil", "pt", "np", "latent"):
         options = {"throw": False, "output_type": kind}

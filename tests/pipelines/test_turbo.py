@@ -11,7 +11,6 @@ from torch.testing import assert_close
 import unitouch_gen
 from tests.helpers.calls import quiet, seeded
 from tests.helpers.small_family import write_small_family
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines.tiny import TURBO
 
 peft = pytest.importorskip("peft", reason="LoRA needs peft")
@@ -67,22 +66,9 @@ def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo: Any,
     assert not torch.allclose(expected, plain, atol=1e-2)
 
 
-def test_saved_and_loaded_it_stays_what_it_is(turbo: Any, name: str, tmp_path: Path) -> None:
-    turbo.save_pretrained(tmp_path)
-    again = quiet(type(turbo).from_pretrained(tmp_path))
-    assert isinstance(again.scheduler, LCMScheduler)
-    assert_close(draw(again, name).images, draw(turbo, name).images, **FINE)
-
-
 def test_the_noise_of_each_step_is_of_each_pictures_own_generator(turbo: Any, name: str) -> None:
     both = draw(turbo, name, 2, generator=[seeded(0), seeded(1)]).images
     assert_close(both[:1], draw(turbo, name, generator=seeded(0)).images, **FINE)
     noise = {"latents": torch.randn(1, *both.shape[1:])}
     first, second = (draw(turbo, name, **noise, generator=seeded(seed)).images for seed in (0, 1))
     assert not torch.allclose(first, second, atol=1e-2)
-
-
-def test_a_family_without_these_weights_is_refused(family: Path, name: str, tmp_path: Path) -> None:
-    write_small_family(tmp_path)
-    with pytest.raises(InvalidInputError, match="`family`"):
-        unitouch_gen.tiny(name, family=tmp_path)
