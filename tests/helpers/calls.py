@@ -9,7 +9,6 @@ from torch import Tensor, nn
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from tests.helpers.components import D
-from unitouch_gen.pipelines import TouchToImagePipeline
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -72,11 +71,3 @@ def diffusers_pipeline(components: dict[str, Any]) -> StableUnCLIPImg2ImgPipelin
     encoder = CLIPVisionModelWithProjection(config).eval()
     processor = CLIPImageProcessor(size=32, crop_size=32)
     return quiet(StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared))
-
-
-def draw_embedding(pipe: Any, **options: Any) -> Tensor:
-    """A picture of a random embedding, by either pipeline."""
-    name = "touch_embeds" if isinstance(pipe, TouchToImagePipeline) else "image_embeds"
-    embeds = torch.randn(1, D, generator=seeded()).to(pipe.unet.dtype)
-    options = {"prompt": "rough brick", "num_inference_steps": 3, "guidance_scale": 3.0, "output_type": "pt", **options}
-    return pipe(**{name: embeds}, generator=seeded(3), **options).images

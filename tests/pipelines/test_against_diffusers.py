@@ -10,11 +10,13 @@ from PIL import Image
 from torch.testing import assert_close
 
 from tests.helpers.calls import diffusers_pipeline, quiet, seeded
-from tests.helpers.calls import draw_embedding as draw
+from tests.helpers.components import D
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 CPU = torch.device("cpu")
+SCHEDULERS = ("DDIM", "DDPM", "DPMSolverMultistep", "EulerAncestralDiscrete", "EulerDiscrete", "HeunDiscrete", "PNDM",
+              "UniPCMultistep")  # fmt: skip
 
 
 @pytest.fixture
@@ -24,12 +26,20 @@ def pair(components):
     return theirs, quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
 
 
+def draw(pipe, **options) -> torch.Tensor:
+    """A picture of a random embedding, by either pipeline."""
+    name = "touch_embeds" if isinstance(pipe, TouchToImagePipeline) else "image_embeds"
+    embeds = torch.randn(1, D, generator=seeded()).to(pipe.unet.dtype)
+    given = {"prompt": "rough brick", "num_inference_steps": 3, "guidance_scale": 3.0, "output_type": "pt", **options}
+    return pipe(**{name: embeds}, generator=seeded(3), **given).images
+
+
 def same(one: torch.Tensor, other: torch.Tensor) -> None:
     assert_close(one, other, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("guidance_scale", [1.0, 7.5])
-@pytest.mark.parametrize("scheduler", ["DDIM", "DPMSolverMultistep", "UniPCMultistep", "PNDM", "EulerDiscrete"])
+@pytest.mark.parametrize("scheduler", SCHEDULERS)
 def test_same_picture_as_diffusers(pair, scheduler, guidance_scale):
     """From given latents, which it takes at the scheduler's first noise level, and from its random numbers."""
     theirs, ours = pair
