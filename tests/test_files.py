@@ -11,14 +11,7 @@ from pathlib import Path
 import pytest
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import (
-    check_writable,
-    read_table,
-    reading,
-    replacing,
-    write_file,
-    writing_folder,
-)
+from unitouch_gen.files import check_writable, read_table, reading, replacing, write_file, writing_folder
 
 
 def names(folder: Path) -> set[str]:
@@ -62,32 +55,6 @@ def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(t
     for place, write in product(("folder", "file/a.txt"), (check_writable, partial(write_file, content=""))):
         with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*Nothing was changed"):
             write("output", tmp_path / place)
-
-
-def test_a_folder_takes_the_place_of_another_and_keeps_what_is_beside(tmp_path):
-    for file, text in {"config.json": "old", "unet/config.json": "old", "notes.md": "mine"}.items():
-        write_file("x", tmp_path / "model" / file, text)
-    with writing_folder("save_directory", tmp_path / "model") as place:
-        write_file("x", place / "config.json", "new")
-        write_file("x", place / "vae" / "config.json", "new")
-    assert names(tmp_path) == {
-        "model/" + name for name in ("config.json", "unet/config.json", "vae/config.json", "notes.md")
-    }
-    assert (tmp_path / "model" / "config.json").read_text() == "new"
-
-
-def test_weights_of_before_go_where_a_reader_could_take_them_for_the_new_ones(tmp_path):
-    for number, (old, new, left) in enumerate([
-        ("model.safetensors", "model-00001-of-00002.safetensors", False),
-        ("model.safetensors.index.json", "model.safetensors", False),
-        ("model.safetensors", "model.fp16.safetensors", True),
-        ("model.fp16-00001-of-00002.safetensors", "model.fp16.safetensors", False),
-    ]):  # fmt: skip
-        folder = tmp_path / str(number)
-        write_file("x", folder / old, "old")
-        with writing_folder("x", folder) as place:
-            write_file("x", place / new, "new")
-        assert names(folder) == {new} | ({old} if left else set())
 
 
 def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
