@@ -4,7 +4,6 @@ Girdhar et al., 2023, "ImageBind: One embedding space to bind them all", with Un
 """
 
 import math
-from types import SimpleNamespace
 
 import torch
 import torch.nn.functional as F
@@ -86,15 +85,13 @@ class ImageBind(nn.Module):
 
     Args:
         config: The sizes.
-        modalities: Some of "vision", "text", "audio", "touch" and "depth".
+        modalities: Some of "vision", "text", "audio" and "touch".
         text_scale: Learned scale of the text's logits.
     """
 
-    def __init__(self, config, modalities=("vision", "text", "audio", "depth"), text_scale=14.0):
+    def __init__(self, config, modalities=("vision", "text", "audio"), text_scale=14.0):
         super().__init__()
         parts = {name: getattr(config, f"{name}_config") for name in ("vision", "text", "audio", "touch")}
-        sizes = {"hidden_size": 16, "num_attention_heads": 2, "num_hidden_layers": 1, "image_size": 8, "patch_size": 4}
-        parts["depth"] = SimpleNamespace(**sizes)
         self.modality_preprocessors, self.modality_trunks = nn.ModuleDict(), nn.ModuleDict()
         self.modality_heads, self.modality_postprocessors = nn.ModuleDict(), nn.ModuleDict()
         for name in modalities:
@@ -118,7 +115,7 @@ class ImageBind(nn.Module):
                 after += [Scale(5.0, learned=False)] if name == "touch" else []
             if name != "text":
                 self.modality_heads[name] = nn.Sequential(head[0], nn.Identity(), head[1])
-            depth, bias_kv = part.num_hidden_layers, name in ("audio", "touch", "depth")
+            depth, bias_kv = part.num_hidden_layers, name in ("audio", "touch")
             self.modality_trunks[name] = Trunk(width, part.num_attention_heads, depth, bias_kv, name == "vision")
             self.modality_postprocessors[name] = nn.Sequential(*after)
         generator = torch.Generator().manual_seed(0)
