@@ -7,12 +7,7 @@ from scipy.special import softmax
 
 from tests.helpers.components import make_components
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.evaluation.zero_shot import (
-    PROMPTS,
-    Named,
-    ZeroShotTouchClassifier,
-    text_embeddings,
-)
+from unitouch_gen.evaluation.zero_shot import PROMPTS, Named, ZeroShotTouchClassifier, text_embeddings
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.world import MATERIAL_NAMES
 
@@ -78,17 +73,6 @@ def test_only_the_best_are_named(classifier, images):
     whole, best = classifier(images, NAMES, top=99), classifier(images, NAMES, top=2)
     assert [list(one.items())[:2] for one in whole] == [list(one.items()) for one in best]
     assert {name for named in classifier(images) for name in named} == set(MATERIAL_NAMES)
-
-
-def test_a_touch_without_a_sensor_is_read_by_the_nearest_one(classifier, images):
-    model, dark = classifier.model, classifier.processor.touch(0.4 * images)  # 0.2 on average, as gelsight's prototype
-    with torch.no_grad():
-        found, named, other = (
-            model.get_touch_features(dark, model.sensor_ids(model.match_sensors(dark, sensor)))
-            for sensor in (None, "gelsight", "digit")
-        )
-    torch.testing.assert_close(found, named)
-    assert not torch.allclose(found, other, atol=1e-3)
 
 
 def test_a_processor_that_reads_no_words_is_refused(classifier):
