@@ -33,10 +33,3 @@ def test_latents_are_shifted_and_scaled_and_decoding_undoes_it(vae: Autoencoder)
     assert latents.shape == (9, vae.config.latent_channels, 32 // scale_factor(vae), 32 // scale_factor(vae))
     torch.testing.assert_close(decode(vae, latents), vae.decode(raw).sample)
     assert decode(vae, latents).shape == pixels.shape and decode(vae, latents).is_contiguous()
-
-
-@torch.no_grad()
-def test_pixels_are_float32_whatever_the_dtype_of_the_network() -> None:
-    kl = MADE["kl"]().to(torch.bfloat16)
-    latents = encode(kl, torch.zeros(1, 3, 32, 32))
-    assert latents.dtype is torch.bfloat16 and decode(kl, latents).dtype is torch.float32

@@ -25,12 +25,6 @@ def test_text_becomes_padded_ids_between_start_and_end(processor: UniTouchProces
     assert encoded["input_ids"].min() >= 0 and encoded["input_ids"].max() < len(tokenizer)
 
 
-def test_what_is_no_text_is_refused_by_name(processor: UniTouchProcessor) -> None:
-    for text in (None, ["a", None], [], "\ud800"):
-        with pytest.raises((InvalidInputError, InvalidTypeError), match="`prompt` is"):
-            processor.text(text, name="prompt")
-
-
 def test_a_tokenizer_that_cannot_pad_is_refused(tokenizer: CLIPTokenizer) -> None:
     """It would ask for gigabytes."""
     other = copy.deepcopy(tokenizer)

@@ -21,13 +21,13 @@ def bumps(seed: int, height: int = 128, width: int = 128, count: int = 40) -> tu
     return each.sum(0), torch.stack([(-dx / wide**2 * each).sum(0), (-dy / wide**2 * each).sum(0)])
 
 
-def shaded(slopes: Tensor, seed: int, channels: int = 3, strength: float = 0.3) -> Tensor:
+def shaded(slopes: Tensor, seed: int, channels: int = 3) -> Tensor:
     """A picture (1, C, H, W) of slopes under lamps of random colours, with a glow across it."""
     rng = torch.Generator().manual_seed(1000 + seed)
     mixture = torch.randn(channels, 2, generator=rng)
     glow = torch.linspace(-1.0, 1.0, slopes.shape[-1]).expand(slopes.shape[-2:])
     base = torch.randn(channels, 1, 1, generator=rng) + torch.randn(channels, 1, 1, generator=rng) * glow
-    return (base + strength * torch.einsum("ck,khw->chw", mixture, slopes))[None]
+    return (base + 0.3 * torch.einsum("ck,khw->chw", mixture, slopes))[None]
 
 
 def alike(a: Tensor, b: Tensor) -> float:
@@ -44,13 +44,6 @@ def test_slopes_and_heights_come_back_whatever_the_lamps_are(size: tuple[int, in
         assert alike(found[0], slopes[0]) > 0.95 and alike(found[1], slopes[1]) > 0.95
         assert alike(found[2], heights) > 0.8  # what is wider than the window is left out
         assert all(0.4 < deviation < 2.5 for deviation in found.flatten(1).std(dim=1))
-
-
-def test_other_lamps_and_less_contrast_give_the_same_relief() -> None:
-    _, slopes = bumps(0)
-    first, second = relief(shaded(slopes, 1))[0], relief(shaded(slopes, 2, strength=0.15))[0]
-    assert min(alike(a, b) for a, b in zip(first, second, strict=True)) > 0.95
-    assert 0.7 < first.std() / second.std() < 1.4
 
 
 def test_two_channels_are_enough_and_one_gives_its_own_direction() -> None:

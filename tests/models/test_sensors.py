@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import SensorBank, SensorMatch
 
 NAMES = ("gelsight", "digit", "taxim")
@@ -38,24 +38,6 @@ def test_retrieval_is_the_smallest_mean_absolute_difference() -> None:
     matches = bank.match(images)
     assert [match.name for match in matches] == [NAMES[index] for index in distances.argmin(axis=1)]
     np.testing.assert_allclose([match.distance for match in matches], distances.min(axis=1), rtol=1e-5)
-
-
-def test_named_sensors_are_taken_whatever_is_nearest() -> None:
-    bank = filled()
-    images = bank.prototype("digit").expand(3, -1, -1, -1)
-    assert [match.name for match in bank.match(images, ["gelsight", None, "taxim"])] == ["gelsight", "digit", "taxim"]
-    match = bank.match(images[:1], "taxim")[0]
-    assert match.name == "taxim" and match.distance > 0.1
-
-
-@pytest.mark.parametrize(
-    ("sensor", "words"),
-    [(["digit", "digit"], "`sensor` is a list of 2 for 3"), (3, "`sensor` is 3"),
-     ("digits", r"`sensor` is 'digits'.*'gelsight', 'digit', 'taxim'.*Did you mean 'digit'.*leave `sensor` out")],
-)  # fmt: skip
-def test_what_is_no_sensor_is_refused_by_name(sensor, words) -> None:
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
-        filled().match(torch.rand(3, 3, 8, 8), sensor)
 
 
 def test_sensors_without_prototypes_are_named_but_never_retrieved() -> None:

@@ -44,7 +44,7 @@ TO_IMAGE = {
     ),
     "negative_prompt_embeds": ([torch.zeros(3, 12, 16)], []),
     "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None]]),
-    "sensor": (["gelsigt", "", ["gelsight"] * 3, [], [3, None]], []),
+    "sensor": (["gelsigt", "", ["gelsight"] * 3, [], [3, None]], [3]),
     "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]), "bridge": ([True], ["london", 1]),
 }  # fmt: skip
 STYLIZE = {
