@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from transformers import CLIPTextConfig, CLIPTextModel
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
@@ -15,52 +15,46 @@ from unitouch_gen.training.tokenizer import train_tokenizer
 D = 16
 
 
-def joint_config() -> UniTouchConfig:
-    clip = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
-    vit = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
-    return UniTouchConfig(
-        projection_dim=D,
-        embedding_norm=3.0,
-        sensors=["gelsight", "digit"],
-        sensor_tokens=2,
-        prototype_size=32,
-        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": D},
-        text_config={**clip, "vocab_size": 600, "max_position_embeddings": 12, "projection_dim": D,
-                     "bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1},
-        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": D},
-        audio_config={**vit, "image_height": 32, "image_width": 16, "num_channels": 1, "projection_dim": D},
-    )  # fmt: skip
+AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
+CLIP = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2,
+        "projection_dim": D}  # fmt: skip
+VIT = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8,
+       "projection_dim": D}  # fmt: skip
+SPACE = {
+    "projection_dim": D, "sensors": ["gelsight", "digit"], "sensor_tokens": 2, "prototype_size": 32,
+    "vision_config": {**CLIP, "image_size": 32, "patch_size": 8},
+    "text_config": {**CLIP, "vocab_size": 600, "max_position_embeddings": 32},
+    "touch_config": {**VIT, "image_height": 32, "image_width": 32},
+    "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
+}  # fmt: skip
+
+
+UNET = {"sample_size": 8, "block_out_channels": (8,), "layers_per_block": 1, "cross_attention_dim": D,
+        "down_block_types": ("CrossAttnDownBlock2D",), "up_block_types": ("CrossAttnUpBlock2D",),
+        "attention_head_dim": 2, "norm_num_groups": 4}  # fmt: skip
+VAE = {"block_out_channels": (8, 8), "norm_num_groups": 4, "down_block_types": ("DownEncoderBlock2D",) * 2,
+       "up_block_types": ("UpDecoderBlock2D",) * 2}  # fmt: skip
+
+
+def joint_config(tokenizer: CLIPTokenizer, **changes: Any) -> UniTouchConfig:
+    """Of a joint space that reads the tokenizer's words."""
+    config = UniTouchConfig(**{**SPACE, **changes})
+    ids = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    config.text_config.update({"vocab_size": len(tokenizer), "max_position_embeddings": 12, **ids})
+    return config
 
 
 def make_components() -> dict:
     torch.manual_seed(0)
     tokenizer = train_tokenizer(["high quality rough brick", "smooth grey metal"], 600, 12)
-    model = UniTouchModel(joint_config()).eval()
+    model = UniTouchModel(joint_config(tokenizer, embedding_norm=3.0)).eval()
     model.sensor_bank.set_prototype("gelsight", torch.full((3, 32, 32), 0.2))
     model.sensor_bank.set_prototype("digit", torch.full((3, 32, 32), 0.8))
     normalizer = StableUnCLIPImageNormalizer(embedding_dim=D)
     normalizer.mean.data.normal_()
     normalizer.std.data.uniform_(0.5, 1.5)
-    unet = UNet2DConditionModel(
-        sample_size=8,
-        block_out_channels=(8,),
-        layers_per_block=1,
-        down_block_types=("CrossAttnDownBlock2D",),
-        up_block_types=("CrossAttnUpBlock2D",),
-        cross_attention_dim=16,
-        attention_head_dim=2,
-        norm_num_groups=4,
-        class_embed_type="projection",
-        projection_class_embeddings_input_dim=2 * D,
-    )
-    vae = AutoencoderKL(
-        block_out_channels=(8, 8),
-        norm_num_groups=4,
-        latent_channels=4,
-        sample_size=16,
-        down_block_types=("DownEncoderBlock2D",) * 2,
-        up_block_types=("UpDecoderBlock2D",) * 2,
-    )
+    unet = UNet2DConditionModel(**UNET, class_embed_type="projection", projection_class_embeddings_input_dim=2 * D)
+    vae = AutoencoderKL(**VAE, latent_channels=4, sample_size=16)
     text_config = CLIPTextConfig(
         vocab_size=len(tokenizer), hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2,
         max_position_embeddings=12, bos_token_id=tokenizer.bos_token_id, eos_token_id=tokenizer.eos_token_id,
@@ -68,11 +62,7 @@ def make_components() -> dict:
     )  # fmt: skip
     return {
         "unitouch": model,
-        "processor": UniTouchProcessor(
-            image_size=32,
-            audio={"clip_seconds": 0.2, "clips": 1, "mel_bins": 32, "frames": 16},
-            tokenizer=tokenizer,
-        ),
+        "processor": UniTouchProcessor(image_size=32, audio=AUDIO, tokenizer=tokenizer),
         "image_normalizer": normalizer.requires_grad_(False),
         "image_noising_scheduler": DDPMScheduler(beta_schedule="squaredcos_cap_v2"),
         "tokenizer": tokenizer,
@@ -88,15 +78,8 @@ def make_components() -> dict:
 def make_x_to_touch() -> dict:
     """What an `XToTouchPipeline` has beside the joint space and its processor."""
     torch.manual_seed(1)
-    unet = UNet2DConditionModel(
-        sample_size=8, in_channels=3, out_channels=3, block_out_channels=(8,), layers_per_block=1,
-        down_block_types=("CrossAttnDownBlock2D",), up_block_types=("CrossAttnUpBlock2D",),
-        cross_attention_dim=D, attention_head_dim=2, norm_num_groups=4, num_class_embeds=2,
-    )  # fmt: skip
-    vae = VQModel(
-        block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=32,
-        down_block_types=("DownEncoderBlock2D",) * 2, up_block_types=("UpDecoderBlock2D",) * 2,
-    )  # fmt: skip
+    unet = UNet2DConditionModel(**UNET, in_channels=3, out_channels=3, num_class_embeds=2)
+    vae = VQModel(**VAE, latent_channels=3, num_vq_embeddings=32)
     return {"unet": unet.eval(), "vae": vae.eval(), "embedding_bank": EmbeddingBank.of(torch.randn(20, D)).eval()}
 
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from transformers import CLIPTokenizer
 
+from tests.helpers.components import AUDIO, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 SENSORS = ("gelsight", "digit", "taxim")
-AUDIO = {"clip_seconds": 0.2, "clips": 2, "mel_bins": 16, "frames": 24}
 
 
 @pytest.fixture(scope="session")
@@ -20,20 +20,7 @@ def tokenizer() -> CLIPTokenizer:
 
 @pytest.fixture
 def config(tokenizer: CLIPTokenizer) -> UniTouchConfig:
-    clip = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-    vit = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "patch_size": 8, "patch_stride": 8}
-    text = {"vocab_size": len(tokenizer), "max_position_embeddings": 12}
-    text |= {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
-    return UniTouchConfig(
-        projection_dim=16,
-        sensors=SENSORS,
-        sensor_tokens=2,
-        prototype_size=16,
-        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": 16},
-        text_config={**clip, **text, "projection_dim": 16},
-        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": 16},
-        audio_config={**vit, "image_height": 16, "image_width": 24, "num_channels": 1, "projection_dim": 16},
-    )
+    return joint_config(tokenizer, sensors=SENSORS, prototype_size=16)
 
 
 @pytest.fixture

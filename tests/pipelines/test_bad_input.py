@@ -11,11 +11,11 @@ from diffusers import StableDiffusionPipeline
 from diffusers.callbacks import SDCFGCutoffCallback
 
 from tests.helpers.calls import Call, networks_of
-from tests.helpers.components import make_components, make_x_to_touch
+from tests.helpers.components import make_pipelines
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 
 NAN, INF = float("nan"), float("inf")
 RATE = 16_000
@@ -102,12 +102,11 @@ def calls_by_argument():
 @pytest.fixture(scope="module")
 def guarded():
     """A call of each pipeline, whose networks fail the test if they run."""
-    shared, own, pictures = make_components(), make_x_to_touch(), torch.rand(2, 3, 32, 32)
-    joint = {name: shared[name] for name in ("unitouch", "processor", "scheduler")}
+    pipes, pictures = make_pipelines(), torch.rand(2, 3, 32, 32)
     calls = {
-        "pipe": Call(TouchToImagePipeline(**shared), {"touch": pictures}),
-        "stylize": Call(TactileStylizationPipeline(**shared), {"touch": pictures, "image": pictures}),
-        "x_to_touch": Call(XToTouchPipeline(**joint, **own, sensors=["gelsight", "digit"]), {"image": pictures}),
+        "pipe": Call(pipes["touch-to-image"], {"touch": pictures}),
+        "stylize": Call(pipes["stylize"], {"touch": pictures, "image": pictures}),
+        "x_to_touch": Call(pipes["x-to-touch"], {"image": pictures}),
     }
 
     def fail(module, *args):

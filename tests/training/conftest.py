@@ -8,24 +8,12 @@ import torch
 from accelerate.state import AcceleratorState
 from diffusers import AutoencoderTiny
 
+from tests.helpers.components import AUDIO, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
 from unitouch_gen.training.stages import save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 
-WIDTH = 16
-AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
-CLIP = {"hidden_size": WIDTH, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2,
-        "projection_dim": WIDTH}  # fmt: skip
-VIT = {"hidden_size": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8,
-       "projection_dim": WIDTH}  # fmt: skip
-SPACE = {
-    "projection_dim": WIDTH, "sensors": ["gelsight", "digit"], "sensor_tokens": 2, "prototype_size": 32,
-    "vision_config": {**CLIP, "image_size": 32, "patch_size": 8},
-    "text_config": {**CLIP, "vocab_size": 600, "max_position_embeddings": 32},
-    "touch_config": {**VIT, "image_height": 32, "image_width": 32},
-    "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
-}  # fmt: skip
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
 BLOCKS |= {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
@@ -55,10 +43,7 @@ def processor(_processor: UniTouchProcessor) -> UniTouchProcessor:
 
 @pytest.fixture
 def config(_processor: UniTouchProcessor) -> UniTouchConfig:
-    tokenizer, config = _processor.tokenizer, UniTouchConfig(**SPACE)
-    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
-    config.text_config.update({"vocab_size": len(tokenizer), "max_position_embeddings": 12, **special})
-    return config
+    return joint_config(_processor.tokenizer)
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from scipy.stats import kstest
 from torch import Tensor, nn
 
-from tests.training.conftest import WIDTH, autoencoder
+from tests.helpers.components import D as WIDTH
+from tests.training.conftest import autoencoder
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
@@ -53,9 +54,7 @@ def make_touch_ldm(backgrounds: Tensor | None = None, **changes: float) -> nn.Mo
     return touch_ldm.TouchDiffusionObjective(Shown(), SCHEDULER, NORM, settings, backgrounds)  # type: ignore[arg-type]
 
 
-def test_touches_are_pulled_to_their_pictures_and_tokens_learn_from_their_own_sensor(
-    model: UniTouchModel,
-) -> None:
+def test_touches_are_pulled_to_their_pictures_and_tokens_learn_from_their_own_sensor(model: UniTouchModel) -> None:
     objective, pixels = TouchObjective(model, STILL, LossWeights(cosine=3.0)).eval(), torch.randn(2, 3, 32, 32)
     objective.augmented = lambda touch: touch  # type: ignore[method-assign]
     embeds, sensors = torch.randn(2, WIDTH), torch.tensor([1, -1])

@@ -14,7 +14,7 @@ from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from tests.training.conftest import AUDIO, SPACE
+from tests.helpers.components import AUDIO, SPACE
 from tests.training.test_recipe import KINDS
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
