@@ -8,11 +8,10 @@ import av
 import h5py
 import numpy as np
 from PIL import Image
-from torch import Tensor
 
 Colour = tuple[int, int, int]
 
-RED, GREEN, BLUE, GREY = (200, 40, 30), (30, 190, 60), (40, 50, 210), (128, 128, 128)
+RED, BLUE = (200, 40, 30), (40, 50, 210)
 
 
 def shade(number: int) -> Colour:
@@ -58,14 +57,3 @@ def write_attempts(file: Path, attempts: Sequence[dict[str, Any]]) -> Path:
 def painted(colour: Colour, size: tuple[int, int] = (32, 40)) -> np.ndarray:
     """An image (H, W, 3) of one colour."""
     return np.broadcast_to(np.array(colour, np.uint8), (*size, 3)).copy()
-
-
-def colour_of(pixels: Tensor) -> Colour:
-    """The mean colour of an image (3, H, W) of bytes."""
-    red, green, blue = pixels.float().mean(dim=(1, 2)).round().int().tolist()
-    return red, green, blue
-
-
-def near(one: Colour, other: Colour, reach: int = 12) -> bool:
-    """Whether two colours are the same but for compression."""
-    return all(abs(a - b) <= reach for a, b in zip(one, other, strict=True))

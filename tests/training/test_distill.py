@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -47,16 +48,13 @@ class Known(nn.Module):
     disable_adapters = enable_adapters = lambda self: None
 
 
-class Nothing:
-    """Conditions of a network that takes none."""
-
-    def conditions(self, batch: dict[str, Tensor], kept: Tensor) -> dict[str, Tensor]:
-        return {}
+NOTHING = SimpleNamespace(conditions=lambda batch, kept: {})
+"""Conditions of a network that takes none."""
 
 
 def make(unet: Any, kind: str = "v_prediction", **settings: int) -> DistillObjective:
     scheduler = DDPMScheduler(**SCHEDULE, prediction_type=kind)
-    asked: Any = (Nothing(), SETTINGS.model_copy(update=settings))
+    asked: Any = (NOTHING, SETTINGS.model_copy(update=settings))
     return DistillObjective(unet, scheduler, *asked, guidance_scale=3.0)
 
 
@@ -191,6 +189,11 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
     cache: Path, tmp_path: Path, capsys: Any
 ) -> None:
     (tmp_path / "empty").mkdir()
+    write_small_family(tmp_path / "family")
+    quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "gels")
+    for file in ("mine/touch/0.png", "mine/picture/0.png", "mine/touch/1.png", "mine/picture/1.png"):
+        write_image(tmp_path / file, (200, 100, len(file)))
+    mine = f"{{path: {tmp_path / 'mine'}, sensor: digit}}"
     make_pipelines()["touch-to-image"].save_pretrained(tmp_path / "teacher")
     other = shutil.copytree(tmp_path / "teacher", tmp_path / "other")
     (other / "model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
@@ -203,24 +206,10 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
         ("broken", "", "`model` is "),
         ("teacher", "--set lora.target_modules=[to_p]", "`lora` does not fit the network"),
         ("teacher", "--set lora.rank=3", "In `lora`, `rank` is unknown"),
+        ("gels", f"--set data.sets=[{mine}]", "`data.sets` have no untouched gels"),
     ):
+        given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split(maxsplit=1))
         with pytest.raises(SystemExit, match="2"):
-            run("distill", DistillRecipe, main, words_of(tmp_path / folder, tmp_path / "run", cache, *words.split()))
+            run("distill", DistillRecipe, main, given)
         (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
         assert message in line and not (tmp_path / "run").exists()
-
-
-def test_data_sets_without_untouched_gels_are_refused_where_the_network_takes_gels(
-    cache: Path, tmp_path: Path, capsys: Any
-) -> None:
-    write_small_family(tmp_path / "family")
-    quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "teacher")
-    for kind in ("touch", "picture"):
-        (tmp_path / "mine" / kind).mkdir(parents=True)
-        for number in range(4):
-            write_image(tmp_path / "mine" / kind / f"{number}.png", (200, 100, 50 * number))
-    sets = f"data.sets=[{{path: {tmp_path / 'mine'}, sensor: digit}}]"
-    words = words_of(tmp_path / "teacher", tmp_path / "run", cache, "--set", sets)
-    with pytest.raises(SystemExit, match="2"):
-        run("distill", DistillRecipe, main, words)
-    assert "`data.sets` have no untouched gels" in capsys.readouterr().err

@@ -11,8 +11,7 @@ from unitouch_gen.training.stages import STAGES, command_of
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(
-    not (CHECKOUT / "Makefile").is_file() or shutil.which("make") is None,
-    reason="there is no checkout or no make",
+    not (CHECKOUT / "Makefile").is_file() or shutil.which("make") is None, reason="there is no checkout or no make"
 )
 
 

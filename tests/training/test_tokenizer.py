@@ -1,7 +1,6 @@
 """The tokenizer: CLIP's form, and no text that it cannot hold."""
 
 import unicodedata
-from pathlib import Path
 
 import pytest
 from transformers import CLIPTokenizer
@@ -16,13 +15,9 @@ def tokenizer() -> CLIPTokenizer:
     return train_tokenizer(TEXTS, 600, 12)
 
 
-def test_a_text_stands_between_start_and_end_and_is_padded_or_cut(tokenizer: CLIPTokenizer) -> None:
+def test_tokens_are_whole_words_between_start_and_end(tokenizer: CLIPTokenizer) -> None:
     start, end = len(tokenizer) - 2, len(tokenizer) - 1
     assert (tokenizer.bos_token_id, tokenizer.eos_token_id, tokenizer.pad_token_id) == (start, end, end)
-    ids = tokenizer("rough brick", padding="max_length").input_ids
-    assert len(ids) == 12 and ids[0] == start and {*ids[ids.index(end) :]} == {end}
-    cut = tokenizer("brick " * 50, truncation=True).input_ids
-    assert len(cut) == 12 and cut[-1] == end
     whole = train_tokenizer(list(TEXTS) * 5, 1024, 24)
     assert all(len(whole(word).input_ids) == 3 for word in ("brick", "Rough", "GLASS"))
     assert all(len(whole(prompt).input_ids) <= len(prompt.replace(",", " ,").split()) + 2 for prompt in PROMPTS)
@@ -38,8 +33,6 @@ def test_no_text_is_lost(tokenizer: CLIPTokenizer, text: str) -> None:
     assert letters(tokenizer.decode(tokenizer(text).input_ids, skip_special_tokens=True)) == letters(text)
 
 
-def test_ids_are_the_same_when_trained_again_or_read(tokenizer: CLIPTokenizer, tmp_path: Path) -> None:
-    tokenizer.save_pretrained(tmp_path)
-    for again in (CLIPTokenizer.from_pretrained(tmp_path), train_tokenizer(TEXTS, 600, 12)):
-        assert again.get_vocab() == tokenizer.get_vocab()
-        assert again(TEXTS).input_ids == tokenizer(TEXTS).input_ids
+def test_ids_are_the_same_when_trained_again(tokenizer: CLIPTokenizer) -> None:
+    again = train_tokenizer(TEXTS, 600, 12)
+    assert again.get_vocab() == tokenizer.get_vocab() and again(TEXTS).input_ids == tokenizer(TEXTS).input_ids

@@ -163,14 +163,12 @@ def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        ("none", "`resume` finds no checkpoint"),
         ("beyond", "`steps` is 15, but .*step-00000020' is beyond it"),
         ("model", "step-00000020', which does not fit this recipe's model"),
     ],
 )
 def test_a_run_that_cannot_go_on_says_why(tmp_path: Path, fault: str, message: str) -> None:
-    if fault != "none":
-        make(tmp_path)[0].fit()
+    make(tmp_path)[0].fit()
     objective, config = Regression(), CONFIG.model_copy(update={"steps": 15 if fault == "beyond" else 20})
     objective.trained = nn.Linear(3, 4 if fault == "model" else 2)
     with pytest.raises(InvalidInputError, match=message):
