@@ -10,9 +10,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
-import soundfile
 import torch
 import typer
 
@@ -23,49 +21,34 @@ from unitouch_gen.cli import commands
 
 TO_IMAGE = "touch-to-image in/dark.png -o out"
 TO_TOUCH = "x-to-touch -o out"
-STYLIZE = "stylize in/dark.png in/bright.png -o out"
 BAD = {
     "spelling": [
         ("bogus", "No such command 'bogus'"),
         ("touch-to-image in/dark.png", "--output"),
         (f"{TO_IMAGE} --solver dimm", "`solver` is 'dimm'", "Did you mean 'ddim'?"),
-        (f"{TO_IMAGE} --sensor gelsigt", "Did you mean 'gelsight'?"),
         (f"{TO_IMAGE} --set heigth=8", "`--set` is 'heigth'", "Did you mean 'height'?"),
-        (f"{STYLIZE} --set mix=papier", "`mix` is 'papier'", "Did you mean 'paper'?"),
-        (f"{TO_TOUCH} --text brick --sensor digits", "Did you mean 'digit'?"),
         ("touch-to-image example:brik -o out", "Did you mean 'brick'?"),
         ("batch in -o out --pipeline stylize", "`--pipeline` is 'stylize'", "'stylization'"),
     ],
     "kinds and ranges": [
-        (f"{TO_IMAGE} --steps many", "--steps"),
         (f"{TO_IMAGE} --steps 0", "--steps"),
         (f"{TO_IMAGE} --guidance nan", "--guidance-scale"),
-        (f"{TO_IMAGE} --tolerance 2", "--tolerance"),
         (f"{TO_IMAGE} --seed -1", "--seed"),
-        (f"{TO_IMAGE} --set height=5", "`height` is 5"),
         (f"{TO_IMAGE} --dtype float8", "`--dtype` is 'float8'"),
         (f"{TO_IMAGE} --device cuda:99", "`--device` is 'cuda:99'"),
-        (f"{TO_TOUCH} --text ' '", "`text[0]` is blank"),
-        ("app --port 0", "--port"),
         ("app --host no.such.host.invalid", "'no.such.host.invalid'"),
         ("classify in/dark.png --labels wood", "`labels`"),
-        ("classify in/dark.png --template feels", "`template`"),
         ("doctor --device meta", "`--device` is 'meta'"),
         ("distill --model in -o out", "`model` names 'in/model_index.json', which does not exist"),
         ("distill --model in -o out --set steps=3", "`set` is 'steps=3'"),
     ],
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
-        ("touch-to-image https://example.org/touch.png -o out", "touch.png', which does not exist"),
         ("touch-to-image empty -o out", "'empty', where there are no images"),
         ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
-        ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cannot be read as an image"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
-        (f"{TO_TOUCH} --audio silence.wav", "`audio` is silent"),
-        (f"{TO_TOUCH} --audio in/dark.png", "cannot be read as a sound"),
         ("batch gone -o out", "'gone', which does not exist"),
-        ("convert unitouch --touch gone.ckpt -o out", "gone.ckpt"),
         ("convert unitouch --touch in/dark.png -o out", "cannot be read as a checkpoint"),
     ],
     "models": [
@@ -74,11 +57,8 @@ BAD = {
     ],
     "combinations": [
         (TO_TOUCH, "No input was given"),
-        (f"{TO_TOUCH} --text brick --sensor digit --background in/dark.png", "`background` was given"),
-        (f"{TO_TOUCH} --text brick --source-sensor digit", "`source_sensor` has no effect"),
         (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` was given 2 times, another 3"),
         (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
-        (f"{TO_IMAGE} --tolerance 0.1 --steps 5", "`tolerance`"),
         ("convert unitouch -o out", "pass `--touch`, `--imagebind` or both"),
     ],
     "outputs": [
@@ -87,7 +67,6 @@ BAD = {
         ("touch-to-image in -o out.png", "'out.png' for 2 pictures"),
         ("touch-to-image in/dark.png -o out.xbm", "`--output` is 'out.xbm'"),
         ("touch-to-image in/dark.png -o words.png/below", "`--output`", "cannot be written to"),
-        ("touch-to-image in/dark.png -o /proc/self/out", "`--output`", "cannot be written to"),
         ("batch in -o /proc/self/out", "`--output`", "cannot be written to"),
     ],
 }  # fmt: skip
@@ -101,8 +80,6 @@ def runs(network: torch.nn.Module, *_: Any, **__: Any) -> None:
 def test_a_bad_command_is_one_line(here, command, models, refused, files, monkeypatch, kind):
     (here / "empty").mkdir()
     (here / "words.png").write_text("no picture")
-    (here / "cut.png").write_bytes((here / "in" / "dark.png").read_bytes()[:100])
-    soundfile.write("silence.wav", np.zeros(4000), 16_000)
     monkeypatch.setattr(torch.nn.Module, "__call__", runs)
     before = files(here)
     for line, *said in BAD[kind]:

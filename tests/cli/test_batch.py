@@ -86,8 +86,6 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         ("touch,promt\nin/dark.png,1\n", [], "Did you mean 'prompt'?"),
         ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
         ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
-        ("touch\nin/dark.png,1\n", [], "other columns in row 1"),
-        ('touch\n"in/dark.png\n', [], "is no table"),
         ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
         ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`--set` is 'bogus'"),
         ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),

@@ -46,9 +46,7 @@ def test_all_that_is_wrong_is_told_and_ends_it_with_1(command, tmp_path):
 
 def test_a_mistake_is_one_line(command, refused, folder):
     for words, message in (
-        (["nowhere"], "`path` is 'nowhere', which is not there"),
         (["{folder}", "--kind", "touch_and_go"], "Data set 'mine' (touch_and_go; all) has no records"),
-        (["{folder}", "--kind", "mine"], "`kind` is 'mine'"),
         (["{folder}", "--materials", "wood"], "`materials` names 1 of 2"),
     ):
         refused(command("data", "check", *(word.format(folder=folder) for word in words)), message)

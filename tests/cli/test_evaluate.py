@@ -66,7 +66,6 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
 REFUSED = [  # words of a command, what is changed in the labels, and what is said
     (("taste",), None, "`table` is 'taste'"),
     (("material", "--data", "nowhere"), None, "nowhere"),
-    (("material", "--seeds", "0"), None, "'--seeds'"),
     (("touch-to-image",), None, "holds a XToTouchPipeline; name a saved TouchToImagePipeline"),
     (("material", "--model", "in"), None, "holds no config.json"),
     (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),

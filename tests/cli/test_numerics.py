@@ -75,16 +75,13 @@ def test_bad_input_exits_with_2_and_one_line(here, command, refused, table, file
     for line, words in (
         ("stability --only fin", "Unknown case 'fin'; --list shows them. Did you mean 'fine'?"),
         ("stability --only", "requires an argument"),
-        ("stability --group stiff", "No such option"),
         ("stability --model other", "holds a StableDiffusionPipeline; name a saved TouchToImagePipeline"),
         ("work-precision -o out", "Pass `--problem` or `--pipeline`"),
         ("work-precision -o out --problem mixture-7.5 --model in", "not of an exact problem"),
-        ("work-precision -o out --problem mixture-7.5 --lora in", "not of an exact problem"),
         ("work-precision -o out --problem mixture-7", "`--problem` is 'mixture-7'"),
         ("work-precision -o out --problem mixture-7.5 --solvers eulr", "Did you mean 'euler'?"),
         ("work-precision -o out --problem mixture-7.5 --steps 5,x", "`--steps` is 'x'"),
         ("work-precision -o out --problem mixture-7.5 --tolerances 2", "`--tolerances` is 2"),
-        ("work-precision -o out --problem mixture-7.5 --seeds 0", "--seeds"),
     ):
         refused(command(*line.split()), words)
     assert not files(here / "out")

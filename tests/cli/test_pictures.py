@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 from tests.helpers import recordings
-from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.pictures import save, unique
 from unitouch_gen.errors import InvalidInputError
 
@@ -64,11 +63,6 @@ def test_a_picture_is_the_same_alone_and_among_others(here, run):
     assert same("alone.png", "two/bright-1.png") and not same("alone.png", "two/bright-2.png")
     run("touch-to-image in/bright.png -o seed.jpg --seed 1")
     assert Image.open("seed.jpg").format == "JPEG" and not same("seed.jpg", "two/bright-1.png")
-
-
-def test_networks_are_of_the_dtype_asked_for(models):
-    pipe = load_pipeline("touch-to-image", model=models["touch-to-image"], dtype="bfloat16")
-    assert {part.dtype for part in (pipe.unet, pipe.vae, pipe.text_encoder)} == {torch.bfloat16}
 
 
 def test_a_photo_is_restyled_by_each_touch(here, run, pipes):
@@ -124,13 +118,6 @@ def test_words_stand_for_files(here, run, words, stems):
         recordings.write(here / "in" / "press.mp4", list(recordings.frames()))
     rows = run(f"touch-to-image {words} -o out")["pictures"]
     assert [Path(row["picture"]).stem for row in rows] == stems
-
-
-def test_what_is_left_out_of_a_folder_is_counted(here, command, models):
-    for name in ("._dark.png", ".DS_Store", "notes.txt"):
-        (here / "in" / name).touch()
-    code, _, err = command("touch-to-image", "in", "-o", "out", "--steps", 2, "--model", models["touch-to-image"])
-    assert (code, err) == (0, "unitouch-gen: 3 other files in in are left out.\n")
 
 
 # Files, and what is printed -------------------------------------------------------------------------------------------

@@ -135,7 +135,6 @@ def test_parts_that_do_not_fit_are_refused(components):
     for words, change in (
         ("`unitouch` has width 16, but `language_bridge` takes 8",
          {"language_bridge": LanguageBridge.for_model(parts["language_model"], 8), **joint}),
-        ("`num_layers`", {"language_model": make_language_parts(num_hidden_layers=3)["language_model"]}),
         ("`prompt_template` is 'Answer'", {"prompt_template": "Answer"}),
     ):  # fmt: skip
         with pytest.raises(InvalidInputError, match=words):
