@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from drawing import MARGIN, draw_grid, font, written
+from drawing import MARGIN, draw_grid
 from tests.helpers.processes import Child, finished, script
 from unitouch_gen import weights
 from unitouch_gen.cli.loading import DRAWING
@@ -37,32 +37,12 @@ def test_no_word_covers_a_tile(blocks):
         assert red(grid).sum() == 15 * side**2
 
 
-def test_a_long_name_breaks_after_an_underscore():
-    name = "gelsight_objectfolder"
-    broken, whole = (written(name, 20, room) for room in (192, 1000))
-    assert whole.width == round(font(20).getlength(name))
-    assert (broken.width, broken.height) == (round(font(20).getlength("objectfolder")), 2 * whole.height)
-
-
 def test_a_tile_keeps_its_pixels():
     pixels = torch.randint(0, 256, (3, 16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     grid = np.asarray(draw_grid([[pixels / 255]], labels=["a"], titles=["b"], side=64))
     expected = np.kron(pixels.permute(1, 2, 0).numpy(), np.ones((4, 4, 1), dtype=np.uint8))
     bottom, right = (edge - MARGIN for edge in grid.shape[:2])
     np.testing.assert_array_equal(grid[bottom - 64 : bottom, right - 64 : right], expected)
-
-
-def test_blocks_stand_side_by_side():
-    rows = [[RED.expand(3, 4, 4)]] * 4
-    options = {"labels": list("abcd"), "titles": ["t"], "side": 32}
-    one, two = (red(draw_grid(rows, **options, blocks=blocks)) for blocks in (1, 2))
-    assert one.any(axis=0).sum() == 32 and one.any(axis=1).sum() == 4 * 32
-    assert two.any(axis=0).sum() == 2 * 32 and two.any(axis=1).sum() == 2 * 32
-
-
-def test_a_place_may_be_empty():
-    rows = [[None, RED.expand(3, 4, 4)], [RED.expand(3, 4, 4), None]]
-    assert red(draw_grid(rows, labels=["", "a"], titles=["", "b"], side=32)).sum() == 2 * 32**2
 
 
 def test_no_sample_replaces_a_tracked_picture_unasked():

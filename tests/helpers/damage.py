@@ -1,6 +1,5 @@
 """What becomes of files: cut, emptied, replaced by something else, or by what has no end; and odd arguments."""
 
-import json
 import os
 import random
 import struct
@@ -50,22 +49,6 @@ SETTINGS: dict[str, Damage] = {
     "an integer of thousands of digits": lambda file: file.write_text(f'{{"a": {"9" * 5000}}}'),
     "no UTF-8": lambda file: file.write_bytes(b'{"a": "\xff"}'),
 }
-
-
-def claim(**changes: Any) -> Damage:
-    """Other settings in a JSON file, `section__key` in one of its sections."""
-
-    def change(file: Path) -> None:
-        settings = json.loads(file.read_text())
-        for name, value in changes.items():
-            *sections, key = name.split("__")
-            inner = settings
-            for section in sections:
-                inner = inner[section]
-            inner[key] = value
-        file.write_text(json.dumps(settings))
-
-    return change
 
 
 # Of `make soak` -------------------------------------------------------------------------------------------------------

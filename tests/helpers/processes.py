@@ -41,8 +41,8 @@ class Child:
     ):
         self.notes = folder.parent / f"{folder.name}.notes"
         self.notes.mkdir(exist_ok=True)
-        options = {"folder": folder, "notes": self.notes, "killed_at": killed_at, "longest": longest}
-        self.process = CONTEXT.Process(target=_call, args=(function, arguments), kwargs=options)
+        given = (function, arguments, folder, self.notes, killed_at, longest)
+        self.process = CONTEXT.Process(target=_call, args=given)
         self.process.start()
 
     def kill(self) -> None:
@@ -74,13 +74,7 @@ def finished(child: Child) -> Child:
 
 
 def _call(
-    function: Callable[..., Any],
-    arguments: Any,
-    *,
-    folder: Path,
-    notes: Path,
-    killed_at: int | None,
-    longest: int | None,
+    function: Callable[..., Any], arguments: Any, folder: Path, notes: Path, killed_at: int | None, longest: int | None
 ) -> None:
     os.chdir(folder)
     for descriptor, name in ((1, "out"), (2, "err")):
@@ -91,7 +85,7 @@ def _call(
     changes = [0]
 
     def hook(event: str, args: tuple) -> None:
-        if event in CHANGES or (event == "open" and _writes(*args)):
+        if event in CHANGES or (event == "open" and args[2] & (os.O_WRONLY | os.O_RDWR)):
             changes[0] += 1
             if changes[0] == killed_at:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -116,10 +110,6 @@ def _call(
         sys.stderr.flush()
         (notes / "changes").write_text(str(done))
         os._exit(code)
-
-
-def _writes(path: Any, mode: str | None, flags: int) -> bool:
-    return bool(flags & (os.O_WRONLY | os.O_RDWR))
 
 
 # What they call -------------------------------------------------------------------------------------------------------
