@@ -82,13 +82,6 @@ def test_the_readme_becomes_one_without_files_beside_it():
 
 
 @without_setup
-def test_a_description_without_an_address_has_its_links_words_and_no_captions():
-    picture = "![A](a.png)\n\n*Of [c](c.md)\nd.*\n\n"
-    text = f"By [*a* page](docs/a.md#b), `[x](y)` and\n[one](https://x.org/).\n\n{picture}End.\n"
-    assert described(text, "") == "By *a* page, `[x](y)` and\n[one](https://x.org/).\n\nEnd.\n"
-
-
-@without_setup
 def test_an_address_that_is_none_is_refused():
     done = subprocess.run(
         [sys.executable, CHECKOUT / "setup.py", "--version"], env={**os.environ, "UNITOUCH_GEN_URL": "host/owner"},
