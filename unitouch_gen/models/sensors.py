@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
 
-Sensors = str | Sequence[str | None] | None  # a name for all images, one for each, or `None` to retrieve them
+Sensors = str | Sequence[str | None] | None
+"""A name for all images, one for each, or `None` to retrieve them."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class SensorBank(nn.Module):
             image that is farther from every sensor is of none; without, the nearest is taken.
     """
 
+    tokens: nn.Parameter
     prototypes: Tensor
     known: Tensor
 
@@ -59,10 +60,10 @@ class SensorBank(nn.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-    def index(self, name: Any) -> int:
+    def index(self, name: str) -> int:
         """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
         if not self.names:
-            raise InvalidInputError(f"`sensor` is {describe(name)}; this model has no sensor tokens, so leave it out.")
+            raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
         hint = "For the touches of any other, leave `sensor` out." if bool(self.known.any()) else ""
         return self.names.index(check_choice("sensor", name, self.names, hint=hint))
 
@@ -83,6 +84,8 @@ class SensorBank(nn.Module):
         the least `layout_distances` over its reach, and none where the image is out of reach of all, unless the
         `nearest` is asked for.
         """
+        if not (sensor is None or isinstance(sensor, str | list | tuple)):
+            raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
         wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
         if len(wanted) != len(raw_pixels):
             counts = f"a list of {len(wanted)} for {len(raw_pixels)} touch images"
@@ -118,7 +121,11 @@ class SensorBank(nn.Module):
 
     def encode(self, encoder: Callable[..., Tensor], inputs: Tensor, indices: Tensor) -> Tensor:
         """An encoder's output for inputs (B, ...) with the tokens of their sensors; index -1 has none."""
-        known, others = (rows.nonzero()[:, 0] for rows in (indices >= 0, indices < 0))
-        parts = [encoder(inputs[known], self.tokens[indices[known].long()])] if len(known) else []
-        parts += [encoder(inputs[others], None)] if len(others) else []
-        return torch.cat(parts)[torch.cat([known, others]).argsort()]
+        rows_of: dict[bool, list[int]] = {}
+        for row, index in enumerate(indices.tolist()):
+            rows_of.setdefault(index >= 0, []).append(row)
+        parts, order = [], list[int]()
+        for has_tokens, rows in rows_of.items():
+            parts.append(encoder(inputs[rows], self.tokens[indices[rows].long()] if has_tokens else None))
+            order += rows
+        return torch.cat(parts)[torch.tensor(order).argsort()]
