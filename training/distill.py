@@ -1,11 +1,11 @@
-"""A pipeline in four evaluations: LCM-LoRA (Luo et al., 2023), by latent consistency distillation.
+"""A pipeline in four evaluations: distribution matching distillation (Yin et al., 2024, "DMD2") of LoRA layers.
 
     python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
 
-The student is the network with LoRA layers. It learns to predict, at the noise levels of diffusers' `LCMScheduler` in
-a few steps, the latents that guided sampling ends at: its prediction at one level is trained to match the one at the
-next level, where guided DDIM leads. The result is a LoRA file. Pipelines use it with that scheduler and a
-`guidance_scale` of 1, since guidance is learnt, too.
+The student is the network with LoRA layers. It draws in the steps of diffusers' `LCMScheduler`, and learns to draw
+what guided sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers
+that learn to denoise what the student draws, and moved where the network's guided prediction differs from the critic's.
+The result is a LoRA file. Pipelines use it with that scheduler and a `guidance_scale` of 1, since guidance is learnt.
 """
 
 import warnings
@@ -15,7 +15,7 @@ import torch
 from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
@@ -23,20 +23,16 @@ from unitouch_gen.errors import InvalidInputError, check_choice, needed
 from unitouch_gen.files import class_name, read_settings, reading
 from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
-from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
+from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts
-from unitouch_gen.training.losses import predict
-from unitouch_gen.training.recipe import Arguments, Settings, Share, build, read, read_recipe
+from unitouch_gen.training.losses import SnrGamma, denoising_losses, predict
+from unitouch_gen.training.recipe import Arguments, Settings, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage, run
-from unitouch_gen.training.trainer import Decay
 
-STUDENT, TARGET = "student", "target"
-"""Names of the two sets of LoRA layers: the trained ones and their moving average."""
-
-SIGMA_DATA, TIMESTEP_SCALING = 0.5, 10.0
-"""Of the boundary condition, as in diffusers' `LCMScheduler`."""
+STUDENT, CRITIC = "student", "critic"
+"""Names of the two sets of LoRA layers."""
 
 Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 
@@ -44,11 +40,9 @@ Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 class DistillSettings(Settings):
     """How the student is taught."""
 
-    guidance_spread: Share  # guidance is uniform around the pipeline's default, within this share of it
-    levels: Annotated[int, Field(ge=1, le=50)]  # steps of `LCMScheduler`, whose noise levels are learnt
-    solver_steps: PositiveInt  # of DDIM from one level to the next
-    target_decay: Decay  # of the moving average of the LoRA layers
-    huber: PositiveFloat  # c of the pseudo-Huber loss
+    steps: Annotated[int, Field(ge=1, le=50)]  # of `LCMScheduler`, in which the student draws
+    margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
+    snr_gamma: SnrGamma  # of the critic's losses
 
 
 class DistillRecipe(Recipe):
@@ -57,10 +51,10 @@ class DistillRecipe(Recipe):
 
 
 class DistillObjective(nn.Module):
-    """Consistency of states a level apart on the trajectories of guided DDIM (Luo et al., 2023, "Latent", Algorithm 1).
+    """The student's loss, whose gradient is Equation 3 of DMD (Yin et al., 2024), and the critic's.
 
     One network is all three: without LoRA layers the teacher, with those of `STUDENT` the student, with those of
-    `TARGET` the target. `conditioned` is the objective that trained the network; it makes the conditions.
+    `CRITIC` the critic. `conditioned` is the objective that trained the network; it makes the conditions.
     """
 
     def __init__(
@@ -68,91 +62,87 @@ class DistillObjective(nn.Module):
         settings: DistillSettings, guidance_scale: float,
     ):  # fmt: skip
         super().__init__()
-        self.trained, self.settings, self.guidance_scale = unet, settings, guidance_scale
+        self.trained, self.scheduler, self.settings, self.guidance_scale = unet, scheduler, settings, guidance_scale
         self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
-        self.prediction_type = scheduler.config.prediction_type
         self.schedule, lcm = NoiseSchedule.of(scheduler), LCMScheduler.from_config(scheduler.config)
-        lcm.set_timesteps(settings.levels)
-        self.timesteps = torch.cat([torch.zeros(1), lcm.timesteps.flip(0)])  # from data to noise
-        self.follow(1.0)  # both begin alike
+        lcm.set_timesteps(settings.steps)
+        self.timesteps = lcm.timesteps.tolist()
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        self.follow(1.0 - self.settings.target_decay)
-        latents, settings = batch["latents"].float(), self.settings
-        count, device = len(latents), latents.device
-        level = torch.randint(1, len(self.timesteps), (count,))
-        first, last = self.timesteps[level], self.timesteps[level - 1]
-        t, sigma = self._levels(first, device)
-        every = torch.ones(count, dtype=torch.bool, device=device)
+        shape, device = batch["latents"].shape, batch["latents"].device
+        every = torch.ones(len(batch["latents"]), dtype=torch.bool, device=device)
         conditions = self.frozen[0].conditions(batch, every)
         unconditional = self.frozen[0].conditions(batch, ~every)
-        both = {name: torch.cat([unconditional[name], given]) for name, given in conditions.items()}
-        spread = settings.guidance_spread * (2.0 * torch.rand(count, 1, 1, 1, device=device) - 1.0)
-        z = alpha(sigma) * (latents + sigma * torch.randn_like(latents))
+        drawn = self.drawn(torch.randn(shape, device=device), conditions)
+        aim = self.moved(drawn.detach(), conditions, unconditional)
+        self._take(CRITIC)
+        critic = denoising_losses(self.trained, self.scheduler, drawn.detach(), self.settings.snr_gamma, **conditions)
+        student = 0.5 * (drawn - aim).square().mean()
+        return {"loss": student + critic["loss"], "student": student.detach(), "critic": critic["mse"]}
+
+    def drawn(self, z: Tensor, conditions: dict[str, Tensor]) -> Tensor:
+        """Latents (B, C, h, w) that the student predicts in one of its steps, from noise (B, C, h, w)."""
+        self._take(STUDENT)
+        last = int(torch.randint(len(self.timesteps), ()))
         with torch.no_grad():
-            self.trained.disable_adapters()
-            z_next = self._guided_ddim(z, first, last, both, self.guidance_scale * (1.0 + spread))
-            self.trained.enable_adapters()
-            self.trained.set_adapter(TARGET)
-            aim = self._consistency(z_next, *self._levels(last, device), conditions)
-        self.trained.set_adapter(STUDENT)
-        error = self._consistency(z, t, sigma, conditions) - aim
-        loss = ((error.square() + settings.huber**2).sqrt() - settings.huber).mean()
-        return {"loss": loss, "mse": error.square().mean().detach()}
+            for timestep, following in zip(self.timesteps[:last], self.timesteps[1:], strict=False):
+                denoised = self._denoised(z, torch.full((len(z),), timestep, device=z.device), conditions)
+                z = self._noised(denoised, torch.full((len(z),), following, device=z.device))
+        return self._denoised(z, torch.full((len(z),), self.timesteps[last], device=z.device), conditions)
 
     @torch.no_grad()
-    def follow(self, share: float) -> None:
-        """Moves the target's layers towards the student's, by a share of the way."""
-        for name, parameter in self.trained.named_parameters():
-            if f".{TARGET}." in name:
-                student = self.trained.get_parameter(name.replace(f".{TARGET}.", f".{STUDENT}."))
-                parameter.lerp_(student, share)
+    def moved(self, drawn: Tensor, conditions: dict[str, Tensor], unconditional: dict[str, Tensor]) -> Tensor:
+        """Drawn latents (B, C, h, w), moved to where the guided teacher expects them rather than the critic."""
+        margin, count = self.settings.margin, self.scheduler.config.num_train_timesteps
+        t = torch.randint(round(margin * count), count - round(margin * count), (len(drawn),), device=drawn.device)
+        z = self._noised(drawn, t)
+        self._take(CRITIC)
+        known = self._denoised(z, t, conditions)
+        self.trained.disable_adapters()
+        without, given = (self._denoised(z, t, one) for one in (unconditional, conditions))
+        self.trained.enable_adapters()
+        real = without + self.guidance_scale * (given - without)
+        size = (drawn - real).abs().mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-3)
+        return drawn + (real - known) / size
 
-    def _levels(self, timesteps: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Timesteps (B,) and their noise levels (B, 1, 1, 1)."""
-        sigmas = self.schedule.sigma(timesteps).float()
-        return timesteps.to(device), sigmas.to(device)[:, None, None, None]
+    def _take(self, layers: str) -> None:
+        """Computes with the student's layers or the critic's; both stay trained."""
+        self.trained.set_adapter(layers)
+        train_layers(self.trained)
 
-    def _guided_ddim(
-        self, z: Tensor, first: Tensor, last: Tensor, both: dict[str, Tensor], guidance_scale: Tensor
-    ) -> Tensor:
-        """States (B, C, h, w) at timesteps `last` (B,), from those at `first`; unconditional `both` come first."""
-        t, sigma = self._levels(first, z.device)
-        for step in range(1, self.settings.solver_steps + 1):
-            without, given = predict(self.trained, torch.cat([z, z]), torch.cat([t, t]), **both).chunk(2)
-            guided = without + guidance_scale * (given - without)
-            ahead = first + (step / self.settings.solver_steps) * (last - first)
-            t, sigma_next = self._levels(ahead.round(), z.device)
-            z = ddim_step(to_denoised(guided, z, sigma, self.prediction_type), z, sigma, sigma_next)
-            sigma = sigma_next
-        return z
+    def _denoised(self, z: Tensor, t: Tensor, conditions: dict[str, Tensor]) -> Tensor:
+        """What the network predicts of the data, (B, C, h, w)."""
+        prediction = predict(self.trained, z, t, **conditions)
+        return to_denoised(prediction, z, self._sigma(t), self.scheduler.config.prediction_type)
 
-    def _consistency(self, z: Tensor, t: Tensor, sigma: Tensor, conditions: dict[str, Tensor]) -> Tensor:
-        """f(z, t) = c_skip z + c_out x_0(z, t) (B, C, h, w), which is z at t = 0."""
-        denoised = to_denoised(predict(self.trained, z, t, **conditions), z, sigma, self.prediction_type)
-        scaled = TIMESTEP_SCALING * t[:, None, None, None]
-        c_skip, c_out = SIGMA_DATA**2 / (scaled**2 + SIGMA_DATA**2), scaled / (scaled**2 + SIGMA_DATA**2) ** 0.5
-        return c_skip * z + c_out * denoised
+    def _noised(self, latents: Tensor, t: Tensor) -> Tensor:
+        """The variance-preserving state (B, C, h, w) of latents at timesteps (B,)."""
+        return self.scheduler.add_noise(latents, torch.randn_like(latents), t)
+
+    def _sigma(self, t: Tensor) -> Tensor:
+        """Noise levels (B, 1, 1, 1) of timesteps (B,)."""
+        return self.schedule.sigma(t.cpu()).float().to(t.device)[:, None, None, None]
 
 
-def ddim_step(denoised: Tensor, z: Tensor, sigma: Tensor, sigma_next: Tensor) -> Tensor:
-    """The variance-preserving state at the next noise level (Song et al., 2021, "DDIM", Equation 12, eta 0)."""
-    noise = (z / alpha(sigma) - denoised) / sigma
-    return alpha(sigma_next) * (denoised + sigma_next * noise)
+def train_layers(unet: UNet2DConditionModel) -> None:
+    """Asks for gradients of all LoRA layers, since peft asks for those of the last ones taken alone."""
+    for name, parameter in unet.named_parameters():
+        if "lora_" in name:
+            parameter.requires_grad_(True)
 
 
 def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
-    """Adds the LoRA layers of student and target to a network; only the student's are trained."""
+    """Adds the LoRA layers of student and critic to a network; only these are trained."""
     config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
     unet.requires_grad_(False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
         try:
-            unet.add_adapter(config, TARGET)
+            unet.add_adapter(config, CRITIC)
             unet.add_adapter(config, STUDENT)
         except ValueError as error:  # no such modules
             raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
-    unet.set_adapter(STUDENT)
+    train_layers(unet)
 
 
 def conditioned_touches(
@@ -207,7 +197,7 @@ def main(stage: Stage) -> None:
     conditioned, dataset = conditioned_by(stage, settings, unet, scheduler)
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
-    layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=TARGET)
+    layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=STUDENT)
     with stage.saving() as place:
         halves = {name: tensor.half() for name, tensor in layers.items()}
         StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)

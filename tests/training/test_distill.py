@@ -1,4 +1,4 @@
-"""LCM-LoRA: what the student is held to, how its run goes on, and how its weights are loaded."""
+"""Distillation: what the student is held to, how its run goes on, and how its weights are loaded."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler, LCMScheduler
+from diffusers import DDPMScheduler, LCMScheduler
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -21,112 +21,105 @@ from tests.helpers.small_family import write_small_family
 from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import run_commands
-from unitouch_gen.training.distill import DistillObjective, DistillRecipe, DistillSettings, add_layers, ddim_step, main
+from unitouch_gen.training.distill import DistillObjective, DistillRecipe, DistillSettings, add_layers, main
 from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(guidance_spread=0.0, levels=50, solver_steps=1, target_decay=0.5, huber=1e-3)
+SETTINGS = DistillSettings(steps=4, margin=0.02, snr_gamma=5.0)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 
 
-class Known(nn.Module):
-    """What a perfect network says where the data are zeros: the velocity of the state's own noise."""
+class Gaussians(nn.Module):
+    """What perfect networks say where the data are normal, of deviation 1 around a mean for each set of layers."""
 
-    def __init__(self, scheduler: DDPMScheduler):
+    def __init__(self, scheduler: DDPMScheduler, **means: float):
         super().__init__()
-        self.alphas = scheduler.alphas_cumprod
+        self.alphas, self.means, self.layers = scheduler.alphas_cumprod, means, "student"
 
-    def forward(self, z: Tensor, t: Tensor, **conditions: Tensor) -> Any:
-        abar = self.alphas[t.long()][:, None, None, None]
-        return UNet2DConditionOutput(sample=z * (abar / (1 - abar)).sqrt())
+    def forward(self, z: Tensor, t: Tensor) -> Any:
+        a = self.alphas[t.long()][:, None, None, None].sqrt()
+        return UNet2DConditionOutput(sample=(1 - a * a) * self.means[self.layers] + a * z)
 
     def set_adapter(self, name: str) -> None:
-        """It has no layers to choose from."""
+        self.layers = name
 
-    disable_adapters = enable_adapters = lambda self: None
+    def disable_adapters(self) -> None:
+        self.layers = "teacher"
+
+    def enable_adapters(self) -> None:
+        """What follows takes layers by name."""
 
 
-NOTHING = SimpleNamespace(conditions=lambda batch, kept: {})
-"""Conditions of a network that takes none."""
-
-
-def make(unet: Any, kind: str = "v_prediction", **settings: int) -> DistillObjective:
+def make(unet: Any, kind: str = "v_prediction") -> DistillObjective:
     scheduler = DDPMScheduler(**SCHEDULE, prediction_type=kind)
-    asked: Any = (NOTHING, SETTINGS.model_copy(update=settings))
-    return DistillObjective(unet, scheduler, *asked, guidance_scale=3.0)
+    conditioned: Any = SimpleNamespace(conditions=lambda batch, kept: {})  # of a network that takes none
+    return DistillObjective(unet, scheduler, conditioned, SETTINGS, guidance_scale=3.0)
 
 
-@pytest.mark.parametrize(("levels", "solver_steps"), [(50, 1), (8, 3)])
-def test_a_network_that_arrives_where_its_solver_does_has_nothing_to_learn(levels: int, solver_steps: int) -> None:
-    objective = make(Known(DDPMScheduler(**SCHEDULE)), levels=levels, solver_steps=solver_steps)
-    torch.manual_seed(0)
-    batch = {"latents": torch.zeros(1024, 4, 4, 4)}
-    assert objective(batch)["loss"] > 1e-4  # beside the data, noise of the lowest level is left as it is
-    objective.timesteps = objective.timesteps[1:]
-    assert objective(batch)["loss"] < 1e-7
+@pytest.mark.parametrize("mean", [-2.0, 0.0, 2.0])
+def test_what_is_drawn_is_moved_from_what_the_critic_knows_to_what_the_teacher_does(mean: float) -> None:
+    objective = make(Gaussians(DDPMScheduler(**SCHEDULE), teacher=mean, critic=0.0), "sample")
+    drawn = torch.randn(64, 1, 8, 8)
+    moved = objective.moved(drawn, {}, {}) - drawn
+    # Both expect the data at a mean of the state and their own: Their difference is constant, of the means' sign.
+    assert_close(moved, moved[:, :, :1, :1].expand_as(moved), atol=1e-5, rtol=0)
+    assert bool((moved.sign() == mean).all()) if mean == 0.0 else bool((moved * mean > 0.0).all())
+    # Its size is its own over how far what is drawn is from what the teacher expects: 2 over about 2 where noise hides
+    # the data, and nothing where it does not.
+    assert 0.3 * abs(mean) / 2 < moved.abs().mean() < 2.0 * abs(mean) / 2 or mean == 0.0
 
 
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
-def test_steps_and_what_is_held_to_are_those_of_diffusers(kind: str) -> None:
+def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None:
     unet = make_components()["unet"]
-    objective, options = make(unet, kind), {**SCHEDULE, "prediction_type": kind}
-    z, states = torch.randn(2, 4, 8, 8), torch.randn(2, 3, 16)
-    conditions = {"encoder_hidden_states": states, "class_labels": torch.randn(2, 32)}
-    ddim, lcm = DDIMScheduler(**options, set_alpha_to_one=False, timestep_spacing="trailing"), LCMScheduler(**options)
-    ddim.set_timesteps(50)
-    lcm.set_timesteps(50)
-    assert objective.timesteps[1:].flip(0).tolist() == ddim.timesteps.tolist() == lcm.timesteps.tolist()
-    with torch.no_grad():
-        for place in (1, 20, 50):
-            levels = (objective.timesteps[[at, at]] for at in (place, place - 1))
-            (t, sigma), (_, sigma_next) = (objective._levels(level, torch.device("cpu")) for level in levels)
-            prediction = unet(z, t, **conditions).sample
-            step = ddim.step(prediction, t[0].long(), z)
-            assert_close(
-                ddim_step(step.pred_original_sample, z, sigma, sigma_next), step.prev_sample, atol=1e-4, rtol=0
-            )
-            lcm._step_index = None
-            found = lcm.step(prediction, t[0].long(), z).denoised
-            assert_close(objective._consistency(z, t, sigma, conditions), found, atol=1e-4, rtol=1e-4)
-            assert not torch.allclose(found, z, atol=0.1)
-        t, sigma = objective._levels(torch.zeros(2), torch.device("cpu"))
-        assert torch.equal(objective._consistency(z, t, sigma, conditions), z)  # at t = 0
+    add_layers(unet, LORA)
+    objective, lcm = make(unet, kind), LCMScheduler(**{**SCHEDULE, "prediction_type": kind})
+    noise = torch.randn(2, 4, 8, 8)
+    conditions = {"encoder_hidden_states": torch.randn(2, 3, 16), "class_labels": torch.randn(2, 32)}
+    seen = set()
+    for seed in range(8):
+        torch.manual_seed(seed)
+        found = objective.drawn(noise, conditions)
+        torch.manual_seed(seed)
+        last, z = int(torch.randint(4, ())), noise
+        lcm.set_timesteps(4)
+        with torch.no_grad():
+            for t in lcm.timesteps[: last + 1]:
+                z, denoised = lcm.step(unet(z, t, **conditions).sample, t, z, return_dict=False)
+        assert_close(found, denoised, atol=1e-4, rtol=1e-4)
+        assert found.requires_grad
+        seen.add(last)
+    assert len(seen) > 2
 
 
-def test_the_teacher_goes_where_guided_ddim_of_diffusers_leads() -> None:
-    unet, ddim = make_components()["unet"], DDIMScheduler(**SCHEDULE, prediction_type="epsilon", set_alpha_to_one=False)
-    ddim.set_timesteps(50)
-    z, scale = torch.randn(2, 4, 8, 8), torch.tensor([2.0, 5.0])[:, None, None, None]
-    both = {"encoder_hidden_states": torch.randn(4, 3, 16), "class_labels": torch.randn(4, 32)}
-    first, last = torch.full((2,), 499.0), torch.full((2,), 459.0)
-    with torch.no_grad():
-        found, expected = make(unet, "epsilon", solver_steps=2)._guided_ddim(z, first, last, both, scale), z
-        for timestep in (499, 479):
-            without, given = unet(torch.cat([expected] * 2), timestep, **both).sample.chunk(2)
-            expected = ddim.step(without + scale * (given - without), timestep, expected).prev_sample
-    assert_close(found, expected, atol=1e-4, rtol=1e-4)
-
-
-def test_layers_alone_are_trained_and_the_target_follows_the_student() -> None:
+def test_layers_alone_are_trained_each_set_by_its_own_loss() -> None:
     unet = make_components()["unet"]
     add_layers(unet, LORA)
     objective, latents = make(unet), torch.randn(8, 4, 8, 8)
     conditions = {"encoder_hidden_states": torch.randn(8, 3, 16), "class_labels": torch.randn(8, 32)}
-    objective.frozen[0].conditions = lambda batch, kept: conditions
-    assert {name.split(".")[-2] for name, one in unet.named_parameters() if one.requires_grad} == {"student"}
-    objective({"latents": latents})["loss"].backward()
-    parameters = dict(unet.named_parameters())
-    learnt = [name for name, one in parameters.items() if one.grad is not None]
-    assert learnt and all(".student." in name for name in learnt)
-    with torch.no_grad():
-        for name in learnt:
-            parameters[name].add_(1.0)
-    before = {name: parameters[name.replace("student", "target")].clone() for name in learnt}
-    objective({"latents": latents})
-    for name in learnt:
-        assert_close(parameters[name.replace("student", "target")], (before[name] + parameters[name]) / 2)
+    nothing = {name: torch.zeros_like(values) for name, values in conditions.items()}
+    objective.frozen[0].conditions = lambda batch, kept: conditions if kept.all() else nothing
+    parameters = {name: one for name, one in unet.named_parameters() if one.requires_grad}
+    assert {name.split(".")[-2] for name in parameters} == {"student", "critic"}
+    losses = objective({"latents": latents})
+    assert all(one.requires_grad for one in parameters.values())
+    losses["loss"].backward()
+    learnt = {name.split(".")[-2] for name, one in parameters.items() if one.grad is not None and one.grad.any()}
+    assert learnt == {"student", "critic"}
+    assert not any(one.grad is not None for name, one in unet.named_parameters() if "lora_" not in name)
+    with torch.no_grad():  # other layers of the critic: what the student is drawn by stays
+        for name, one in parameters.items():
+            one.add_(0.5 * ("critic" in name))
+    states = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        states.append(objective.drawn(latents, conditions))
+        with torch.no_grad():
+            for name, one in parameters.items():
+                one.add_("critic" in name)
+    assert torch.equal(*states)
 
 
 PIPELINES = {"touch-to-image": "touch", "x-to-touch": "image"}

@@ -68,7 +68,7 @@ def distill(
     cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
 ) -> None:
-    """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (LCM-LoRA).
+    """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (DMD2, LoRA).
 
     Example: unitouch-gen distill --model my-pipeline -o runs/turbo
     """
