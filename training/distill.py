@@ -15,7 +15,7 @@ import torch
 from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from pydantic import Field
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
@@ -42,7 +42,8 @@ class DistillSettings(Settings):
 
     steps: Annotated[int, Field(ge=1, le=50)]  # of `LCMScheduler`, in which the student draws
     margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
-    snr_gamma: SnrGamma  # of the critic's losses
+    critic_rank: PositiveInt  # of the critic's LoRA layers, which are not kept
+    snr_gamma: SnrGamma  # of its losses
 
 
 class DistillRecipe(Recipe):
@@ -131,15 +132,17 @@ def train_layers(unet: UNet2DConditionModel) -> None:
             parameter.requires_grad_(True)
 
 
-def add_layers(unet: UNet2DConditionModel, lora: Arguments) -> None:
+def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int) -> None:
     """Adds the LoRA layers of student and critic to a network; only these are trained."""
-    config = build("lora", needed("peft").LoraConfig, lora, lora_alpha=lora.get("r"))
+    ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's own
+    kind = needed("peft").LoraConfig
+    configs = {name: build("lora", kind, {**lora, "r": rank}, lora_alpha=rank) for name, rank in ranks.items()}
     unet.requires_grad_(False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
         try:
-            unet.add_adapter(config, CRITIC)
-            unet.add_adapter(config, STUDENT)
+            for name, config in configs.items():
+                unet.add_adapter(config, name)
         except ValueError as error:  # no such modules
             raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
     train_layers(unet)
@@ -193,7 +196,7 @@ def main(stage: Stage) -> None:
     with reading("model", folder):
         unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
-    add_layers(unet, recipe.lora)
+    add_layers(unet, recipe.lora, recipe.objective.critic_rank)
     conditioned, dataset = conditioned_by(stage, settings, unet, scheduler)
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)

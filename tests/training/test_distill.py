@@ -26,7 +26,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(steps=4, margin=0.02, snr_gamma=5.0)
+SETTINGS = DistillSettings(steps=4, margin=0.02, critic_rank=2, snr_gamma=5.0)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 
@@ -74,7 +74,7 @@ def test_what_is_drawn_is_moved_from_what_the_critic_knows_to_what_the_teacher_d
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None:
     unet = make_components()["unet"]
-    add_layers(unet, LORA)
+    add_layers(unet, LORA, 3)
     objective, lcm = make(unet, kind), LCMScheduler(**{**SCHEDULE, "prediction_type": kind})
     noise = torch.randn(2, 4, 8, 8)
     conditions = {"encoder_hidden_states": torch.randn(2, 3, 16), "class_labels": torch.randn(2, 32)}
@@ -96,7 +96,7 @@ def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None
 
 def test_layers_alone_are_trained_each_set_by_its_own_loss() -> None:
     unet = make_components()["unet"]
-    add_layers(unet, LORA)
+    add_layers(unet, LORA, 3)
     objective, latents = make(unet), torch.randn(8, 4, 8, 8)
     conditions = {"encoder_hidden_states": torch.randn(8, 3, 16), "class_labels": torch.randn(8, 32)}
     nothing = {name: torch.zeros_like(values) for name, values in conditions.items()}
@@ -126,7 +126,7 @@ PIPELINES = {"touch-to-image": "touch", "x-to-touch": "image"}
 RECIPE = (
     "data.drawn={sensors: [digit], objects: 1, contacts_per_object: 1}", "trainer.steps=2", "trainer.batch_size=8",
     "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2", "trainer.learning_rate=0.1",
-    "lora.r=2",
+    "lora.r=2", "objective.critic_rank=2",
 )  # fmt: skip
 
 
