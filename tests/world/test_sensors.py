@@ -121,6 +121,8 @@ def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:
         (lambda: draw_sensor(-1, 0), "seed"),
         (lambda: draw_sensor(0, 1.5), "number"),
         (lambda: draw_sensor(0, 0, near=math.nan), "near"),
+        (lambda: untouched_gel("digit", 64), "sensor"),
+        (lambda: untouched_gel(PLAIN, 0), "resolution"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(call, named: str) -> None:

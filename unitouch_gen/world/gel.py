@@ -6,12 +6,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.errors import check_integer, check_kind
 from unitouch_gen.world.grids import PATCH_MM, convolved, pixel_axis, slopes, wavenumbers
 from unitouch_gen.world.sensors import Sensor
 
 
 def untouched_gel(sensor: Sensor, resolution: int) -> Tensor:
-    """What a sensor's camera sees of its gel where nothing touches it, without noise, (3, S, S) in [0, 1]."""
+    """What a sensor's camera sees of its gel where nothing touches it, without noise, (3, S, S) in [0, 1].
+
+    Raises:
+        InvalidInputError, InvalidTypeError: On a sensor or a resolution that is none.
+    """
+    check_kind("sensor", sensor, Sensor)
+    check_integer("resolution", resolution, 1, 2**14)
     pixels, _ = gel_square(sensor, resolution)
     return gel_image(torch.zeros(1, pixels, pixels), sensor, resolution)[0]
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from zlib import crc32
 
@@ -10,7 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts, describe
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_texts,
+    describe,
+    first_line,
+)
 from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
@@ -82,8 +90,8 @@ class World:
                 the first.
 
         Raises:
-            InvalidTypeError: If modalities or sensors are no list.
-            InvalidInputError: On an unknown modality, sensor or material, or names that are no integers (N,) in range.
+            InvalidTypeError: If names of contacts are no integers, modalities or sensors no list.
+            InvalidInputError: On an unknown modality, sensor or material, or names that are not (N,), or not as many.
         """
         # 1. Check, and draw the numbers of the contacts.
         asked = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
@@ -165,12 +173,14 @@ def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
 
 def _numbers(label: str, values: object, count: int | None = None, most: float = math.inf) -> Tensor:
     """One part of the names of N contacts, int64 (N,), from 0 to `most`."""
-    numbers = torch.tensor(0.5)  # of what torch cannot read
-    with suppress(TypeError, ValueError, RuntimeError):
+    try:
         numbers = torch.as_tensor(values)
-    integers = torch.can_cast(numbers.dtype, torch.int64) and numbers.dtype != torch.bool and not numbers.is_sparse
-    if not integers or numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
-        raise InvalidInputError(f"`{label}` is {describe(values)}; pass one integer for each contact, such as [3].")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidTypeError(f"`{label}` cannot be read as integers ({first_line(error)}); pass one each.") from error
+    if numbers.is_sparse or numbers.dtype == torch.bool or not torch.can_cast(numbers.dtype, torch.int64):
+        raise InvalidTypeError(f"`{label}` is {describe(values)}; it has to hold integers.")
+    if numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
+        raise InvalidInputError(f"`{label}` is {describe(values)}; pass one for each contact, such as [3].")
     for end in numbers.aminmax():
         check_integer(label, int(end), 0, most)
     return numbers.long()
