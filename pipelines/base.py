@@ -64,8 +64,11 @@ def runs_networks(method: Method) -> Method:
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        weights = list(getattr(self, self._main_network).parameters())
+        if any(one.is_meta for one in weights):
+            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
         # On a CPU, threads of a network with fewer parameters mostly wait for each other.
-        small = sum(one.numel() for one in getattr(self, self._main_network).parameters()) < 20_000_000
+        small = sum(one.numel() for one in weights) < 20_000_000
         _threads.append([*_threads, torch.get_num_threads()][0])
         torch.set_num_threads(1 if small else _threads[0])
         try:

@@ -191,6 +191,8 @@ class TouchToTextPipeline(UniTouchPipeline):
         known -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are ours to say
         for name in given.keys() - known:
             raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
+        if given.get("streamer") is not None and len(prompts) > 1:
+            raise InvalidInputError(f"`streamer` is for one answer, not for {len(prompts)}; leave it out.")
         for name in ("num_beams", "num_return_sequences"):
             check_integer(name, given.get(name, 1), 1)
         with usable(given):

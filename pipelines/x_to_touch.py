@@ -87,6 +87,9 @@ class XToTouchPipeline(UniTouchPipeline):
             "`unet`", default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
         )  # fmt: skip
+        if unet.config.class_embed_type is not None:
+            kind = unet.config.class_embed_type
+            raise InvalidInputError(f"`unet` takes class labels of the kind {kind!r}, as unCLIP's.")
         others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
         labels = unet.config.num_class_embeds or 0
         if labels != len(sensors) + others:

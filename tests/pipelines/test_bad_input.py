@@ -149,11 +149,14 @@ def test_what_needs_a_part_that_is_missing(components, x_components, touch):
 
 
 def test_parts_and_settings_that_do_not_fit_are_refused_by_name(pipe, components, x_components):
+    unclip = x_components["unet"]
+    unclip = unclip.from_config(unclip.config, num_class_embeds=None, class_embed_type="identity")
     stable = {name: components[name] for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
     stable["scheduler"] = stable["scheduler"].from_config(stable["scheduler"].config, steps_offset=1)  # as theirs is
     optional = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
     for name, make in {
         "embedding_bank": lambda: TouchToImagePipeline(**{**components, "embedding_bank": EmbeddingBank(3, 7)}),
+        "unet": lambda: XToTouchPipeline(**{**x_components, "unet": unclip}),
         "sensors": lambda: XToTouchPipeline(**x_components, sensors=["gelsight"]),
     }.items():  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}`"):

@@ -111,6 +111,7 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("temperatur", InvalidInputError, {**two, "temperatur": 0.5}),
         ("generate", InvalidInputError, {**two, "early_stopping": "soon"}),
         ("num_beams", InvalidInputError, {**two, "num_beams": 0}),
+        ("streamer", InvalidInputError, {**two, "streamer": TextIteratorStreamer(ask.tokenizer)}),
         ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
         ("generator", InvalidTypeError, {**two, "generator": 3}),
         ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),
