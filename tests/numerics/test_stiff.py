@@ -1,6 +1,7 @@
-"""Solvers on stiff and extreme problems, and under networks that break or round, each with an a-priori bound."""
+"""Stiff and extreme problems, networks that break or round, extreme calls of pipelines: each has an a-priori bound."""
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -12,11 +13,14 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.numerics.problems import PROBLEMS, Problem
-from unitouch_gen.numerics.stability import Case, error, within
+from unitouch_gen.numerics.stability import Case, cases, error, within
+from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import SOLVERS, ReturnCode, prepare_steps
 from unitouch_gen.solvers import MIN_LEVEL_RATIO
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
+
+KINDS = ("touch-to-image", "stylization", "x-to-touch")
 
 ROUNDING = 4 * 2.0**-23
 """Relative error of a step of some four operations in float32."""
@@ -178,12 +182,13 @@ def network_cases() -> Iterator[Case]:
 
 
 GROUPS: dict[tuple[str, bool], list[Case]] = {}
-"""Cases by problem, slow ones apart: they take hundreds of evaluations."""
-for each in (*solver_cases(), *network_cases()):
-    slow = any(words in each.name for words in ("1000 steps", "guidance 100", "0.001"))
-    GROUPS.setdefault((each.name.split(",")[0], slow), []).append(each)
+"""Cases by problem or pipeline, slow ones apart: hundreds of evaluations, and pipelines in half precision."""
+for each in (*solver_cases(), *network_cases(), *cases(tiny, KINDS)):
+    slow = any(words in each.name for words in ("1000 steps", "guidance 100", "0.001", ": torch."))
+    GROUPS.setdefault((re.split("[,:]", each.name)[0], slow), []).append(each)
 
 
+@pytest.mark.filterwarnings("ignore")  # libraries warn of extreme input
 @pytest.mark.parametrize(
     "group", [pytest.param(key, id=key[0], marks=pytest.mark.slow if key[1] else ()) for key in GROUPS]
 )
@@ -191,6 +196,18 @@ def test_every_case_keeps_its_bound(group: tuple[str, bool]) -> None:
     for case in GROUPS[group]:
         value, bound = case.run()
         assert value <= bound, f"{case.name}: {value:.2g} is above {bound:.2g} ({case.reason})"
+
+
+def test_names_are_unique_and_no_pipeline_is_loaded_to_list_them() -> None:
+    found = cases(lambda kind, dtype: pytest.fail(f"{kind} was loaded"), KINDS)
+    assert len({case.name for case in found}) == len(found)
+
+
+def test_what_is_not_finite_or_ends_otherwise_has_an_infinite_error() -> None:
+    result, ones, codes = torch.tensor([[1.0, math.nan], [1.0, 1.0]]), torch.ones(2, 2), [SUCCESS] * 2
+    assert error(result, codes, exact=ones) == math.inf
+    assert error(ones, codes, DIVERGED) == math.inf
+    assert error(ones, codes, exact=2 * ones) == 0.5
 
 
 @pytest.mark.parametrize("scale", [1.0, 7.5])
