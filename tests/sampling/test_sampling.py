@@ -1,20 +1,14 @@
-"""What a call may say of its steps, and the run: starts, interrupts, and what breaks or diverges."""
+"""What a call may say of its steps; the run: starts, interrupts, and what breaks or diverges; and its report."""
 
+import json
 import math
+import time
+from contextlib import suppress
 from dataclasses import replace
 
+import diffusers
 import pytest
 import torch
-from diffusers import (
-    DDIMScheduler,
-    EulerDiscreteScheduler,
-    FlowMatchEulerDiscreteScheduler,
-    HeunDiscreteScheduler,
-    LCMScheduler,
-    PNDMScheduler,
-    TCDScheduler,
-    UniPCMultistepScheduler,
-)
 
 from tests.helpers.calls import seeded
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
@@ -44,14 +38,16 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
 def test_steps_that_cannot_be_made_are_refused():
     for arguments, words in (
         ({"scheduler": "ddim"}, "`scheduler` is 'ddim'"),
-        ({"solver": "ddim", "scheduler": FlowMatchEulerDiscreteScheduler()}, "has no noise levels"),
+        ({"solver": "ddim", "scheduler": diffusers.FlowMatchEulerDiscreteScheduler()}, "has no noise levels"),
         ({"num_inference_steps": 1001}, "`num_inference_steps` is 1001"),
         ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but has no effect with `tolerance`"),
         ({"tolerance": 0.1, "max_evaluations": 1}, "`max_evaluations` is 1"),
-        ({"init_strength": 0.5, "scheduler": FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),
-        ({"scheduler": DDIMScheduler(steps_offset=1), "num_inference_steps": 1000}, "1000, with .* timestep 1000 of"),
-        ({"scheduler": EulerDiscreteScheduler(timestep_spacing="leading"), "num_inference_steps": 1}, "timestep 0 of"),
-    ):
+        ({"init_strength": 0.5, "scheduler": diffusers.FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),
+        ({"num_inference_steps": 1000, "scheduler": diffusers.DDIMScheduler(steps_offset=1)},
+         "1000, with .* timestep 1000 of"),
+        ({"num_inference_steps": 1, "scheduler": diffusers.EulerDiscreteScheduler(timestep_spacing="leading")},
+         "timestep 0 of"),
+    ):  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
             prepare_steps(**{"scheduler": OWN, **arguments})
 
@@ -60,17 +56,17 @@ def test_steps_that_cannot_be_made_are_refused():
 @pytest.mark.parametrize(
     "how",
     [
-        {"solver": "ddim"}, {"solver": "unipc"}, {"scheduler": DDIMScheduler(**STABLE_DIFFUSION)},
-        {"scheduler": PNDMScheduler(skip_prk_steps=True, **STABLE_DIFFUSION)}, {"scheduler": HeunDiscreteScheduler()},
-        {"scheduler": UniPCMultistepScheduler(use_exponential_sigmas=True, prediction_type="v_prediction")},
-        {"scheduler": EulerDiscreteScheduler(use_karras_sigmas=True)}, {"scheduler": LCMScheduler()},
-        {"scheduler": TCDScheduler()},
+        "ddim", "unipc", diffusers.DDIMScheduler(**STABLE_DIFFUSION), diffusers.HeunDiscreteScheduler(),
+        diffusers.PNDMScheduler(skip_prk_steps=True, **STABLE_DIFFUSION), diffusers.LCMScheduler(),
+        diffusers.UniPCMultistepScheduler(use_exponential_sigmas=True, prediction_type="v_prediction"),
+        diffusers.EulerDiscreteScheduler(use_karras_sigmas=True), diffusers.TCDScheduler(),
     ],
 )  # fmt: skip
 def test_a_start_lies_at_its_share_whatever_the_number_of_steps(how, share):
+    given = {"scheduler": OWN, "solver": how} if isinstance(how, str) else {"scheduler": how}
+
     def start(count: int) -> float:
-        steps = prepare_steps(how.get("scheduler", OWN), solver=how.get("solver"), num_inference_steps=count,
-                              init_strength=share)  # fmt: skip
+        steps = prepare_steps(**given, num_inference_steps=count, init_strength=share)
         assert steps.count == max(round(share * count), 1)
         if steps.scheduler is None:
             return math.log(steps.sigmas[0])
@@ -80,8 +76,8 @@ def test_a_start_lies_at_its_share_whatever_the_number_of_steps(how, share):
 
     starts = [start(count) for count in (1, 2, 3, 4, 10, 50)]
     assert max(starts) - min(starts) < 1e-3
-    if "solver" in how:
-        whole = prepare_steps(OWN, solver=how["solver"], num_inference_steps=100)
+    if "solver" in given:
+        whole = prepare_steps(**given, num_inference_steps=100)
         assert starts[0] == pytest.approx(math.log(whole.sigmas[round(100 * (1 - share))]), abs=0.1)
 
 
@@ -106,9 +102,6 @@ def test_progress_ends_at_one(solver):
         shares = []
         run(progress=shares.append, **options)
         assert shares == sorted(shares) and shares[-1] == 1.0
-
-
-# Callbacks ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -189,7 +182,7 @@ def test_states_are_judged_as_networks_see_them(solver, size, code):
     def grow(step, timestep, latents, run):
         return latents * (size * DIVERGED_RMS / shown[-1].min() if step == 0 else 1.0)
 
-    scheduler = EulerDiscreteScheduler(**STABLE_DIFFUSION, use_karras_sigmas=True)
+    scheduler = diffusers.EulerDiscreteScheduler(**STABLE_DIFFUSION, use_karras_sigmas=True)
     _, report = run(network, scheduler=scheduler, solver=solver, on_step=grow, throw=False)
     assert shown[1].min() > 0.8 * size * DIVERGED_RMS and report.codes == [code] * 3
 
@@ -199,3 +192,33 @@ def test_sound_runs_are_a_success_and_too_few_steps_for_a_guidance_diverge(solve
     assert run(problem=replace(GUIDED, guidance_scale=30.0), solver=solver, num_inference_steps=50)[1].success
     _, report = run(problem=replace(GUIDED, guidance_scale=1000.0), solver=solver, num_inference_steps=6, throw=False)
     assert report.codes[0] in (DIVERGED, NON_FINITE)
+
+
+# The report -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
+    report, started = RunReport(), time.perf_counter()
+    for _ in range(2):
+        with suppress(KeyError), report.stage("touch"):
+            time.sleep(0.01)
+            raise KeyError
+    assert 0.02 <= report.seconds["touch"] <= time.perf_counter() - started
+
+
+def test_it_is_a_line_of_solver_counts_time_and_outcome_and_goes_through_json_as_a_copy():
+    report = RunReport(solver="unipc", steps=10, evaluations=10, seconds={"touch": 0.25, "denoising": 1.5},
+                       codes=[SUCCESS, NON_FINITE], failed_at={1: 3}, left_out=["VAE"],
+                       unknown={"touch": ["unlike anything known", None]})  # fmt: skip
+    values = json.loads(json.dumps(report.to_dict()))
+    assert values["codes"] == ["success", "non_finite"] and values["failed_at"] == {"1": 3}
+    assert values["seconds"] == report.seconds
+    report.to_dict()["left_out"].append("x")
+    assert report.left_out == ["VAE"] and "\n" not in str(report)
+    for part in ("unipc: 10 steps, 10 evaluations, 1.75 s (touch", "success, non_finite; 1 of the inputs unknown"):
+        assert part in str(report)
+    assert str(RunReport(codes=[SUCCESS])).endswith("0 evaluations, 0.00 s (); all finite")
+
+
+def test_every_code_has_a_message():
+    assert all(code.message.endswith(".") for code in ReturnCode)
