@@ -9,24 +9,13 @@ import pytest
 import torch
 import typer
 
-from unitouch_gen.errors import (
-    InvalidInputError,
-    InvalidTypeError,
-    NonFiniteError,
-    UnfamiliarInputWarning,
-    check_choice,
-    check_integer,
-    check_number,
-    check_tensor,
-    describe,
-    needed,
-    run_commands,
-)
+from unitouch_gen import errors
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError, UnfamiliarInputWarning
 
-integer = partial(check_integer, "x", low=1, high=5)
-number = partial(check_number, "x", low=0.0, high=1.0)
+integer = partial(errors.check_integer, "x", low=1, high=5)
+number = partial(errors.check_number, "x", low=0.0, high=1.0)
 wide = torch.zeros(2, 3)
-of_shape = lambda value, **options: check_tensor("x", value, "B", 3, **options)  # noqa: E731
+of_shape = lambda value, **options: errors.check_tensor("x", value, "B", 3, **options)  # noqa: E731
 
 
 def test_what_is_on_the_edge_passes_as_a_plain_number():
@@ -43,7 +32,7 @@ def test_what_cannot_be_used_is_refused_by_name():
     for check, value, error, words in (
         (integer, 0, InvalidInputError, "is 0; it has to be a number from 1 to 5"),
         (number, 1.0000001, InvalidInputError, "a number from 0 to 1"),
-        (partial(check_choice, "x", choices=("heun", "ddim")), "huen", InvalidInputError, "Did you mean 'heun'"),
+        (partial(errors.check_choice, "x", choices=("heun", "ddim")), "huen", InvalidInputError, "Did you mean 'heun'"),
         *((of_shape, value, InvalidTypeError, "") for value in (wide.int(), wide.to_sparse(), wide.to("meta"))),
         *((of_shape, value, InvalidInputError, "") for value in (wide[:0], wide.log(), wide[0], wide[:, :2])),
     ):
@@ -54,12 +43,12 @@ def test_what_cannot_be_used_is_refused_by_name():
 
 def test_descriptions_are_short():
     for value in ("a" * 500, wide, np.zeros(3), [1, 2], object(), int, None, 10**200):
-        assert 0 < len(describe(value)) <= 80
+        assert 0 < len(errors.describe(value)) <= 80
 
 
 def test_a_missing_extra_is_named():
     with pytest.raises(InvalidInputError, match=r"pip install 'unitouch_gen\[train\]'"):
-        needed("no_such_module")
+        errors.needed("no_such_module")
 
 
 @pytest.mark.parametrize("error", [InvalidInputError("a\nb"), NonFiniteError("a\nb"), typer.BadParameter("a\nb")])
@@ -71,7 +60,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(error, capsys):
         raise error
 
     with pytest.raises(SystemExit) as ended:
-        run_commands(app, "unitouch-gen", [])
+        errors.run_commands(app, "unitouch-gen", [])
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert not out and err.count("\n") == 1 and err.startswith("unitouch-gen: ") and "a b" in err
@@ -85,5 +74,5 @@ def test_warnings_of_ours_are_lines_and_others_are_left_out(capsys):
         warnings.warn("a touch", UnfamiliarInputWarning, stacklevel=2)
         warnings.warn_explicit("theirs", UserWarning, "file", 1, module="diffusers.models")
 
-    run_commands(app, "unitouch-gen", [])
+    errors.run_commands(app, "unitouch-gen", [])
     assert capsys.readouterr().err == "unitouch-gen: a touch\n"

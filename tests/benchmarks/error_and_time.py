@@ -16,13 +16,7 @@ from diffusers import DDIMScheduler, StableUnCLIPImg2ImgPipeline
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
 from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
-from unitouch_gen.numerics.work_precision import (
-    BASELINES,
-    measure,
-    pareto_front,
-    pipeline_target,
-    world_inputs,
-)
+from unitouch_gen.numerics.work_precision import BASELINES, measure, pareto_front, pipeline_target, world_inputs
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.pipelines.tiny import TURBO
 

@@ -6,15 +6,8 @@ import torch
 import torch.nn.functional as F
 from sklearn.metrics import average_precision_score
 
+from unitouch_gen.evaluation import metrics
 from unitouch_gen.evaluation.controls import class_means, others, statistics, with_controls
-from unitouch_gen.evaluation.metrics import (
-    correlated,
-    frechet_distance,
-    linear_probe,
-    mean_average_precision,
-    retrieval,
-    share_right,
-)
 
 LABELS = torch.arange(4).repeat(20)
 
@@ -45,7 +38,7 @@ def test_controls_stand_beside_each_figure():
     values = random(80, 5)
 
     def measure(samples: torch.Tensor) -> dict[str, float]:
-        return {"own": retrieval(samples, values, LABELS, size=16), "length": samples.norm().item()}
+        return {"own": metrics.retrieval(samples, values, LABELS, size=16), "length": samples.norm().item()}
 
     found = with_controls(measure, {"value": values, "class_mean": class_means(values, LABELS), "ceiling": values})
     assert set(found) == {"own", "length"}
@@ -70,17 +63,18 @@ def test_others_of_the_class_are_those_of_all_draws():
     gallery = torch.tensor([[1.0, 0.2], [1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.01]])
     labels, query = torch.tensor([0, 0, 0, 0, 1]), torch.tensor([[1.0, 0.0]])
     for size, share in ((2, 2 / 3), (3, 1 / 3), (4, 0.0)):
-        assert retrieval(query, gallery, labels, torch.tensor([0]), size=size) == pytest.approx(share)
-    assert retrieval(torch.ones(80, 2), torch.ones(80, 2), LABELS, size=8) == pytest.approx(1 / 8)  # all as near
+        assert metrics.retrieval(query, gallery, labels, torch.tensor([0]), size=size) == pytest.approx(share)
+    alike = torch.ones(80, 2)
+    assert metrics.retrieval(alike, alike, LABELS, size=8) == pytest.approx(1 / 8)
 
 
 def test_mean_average_precision_is_scikit_learns():
     queries, gallery, objects = random(30, 3), random(30, 3, seed=1), torch.arange(30) // 3
     cosine = F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
     each = [average_precision_score(objects == one, row) for one, row in zip(objects, cosine.numpy(), strict=True)]
-    assert mean_average_precision(queries, gallery, objects) == pytest.approx(np.mean(each), abs=1e-6)
-    assert mean_average_precision(torch.eye(30), torch.eye(30)[objects * 3], objects) > 0.3
-    assert mean_average_precision(torch.eye(30)[objects], torch.eye(30)[objects], objects) == pytest.approx(1.0)
+    assert metrics.mean_average_precision(queries, gallery, objects) == pytest.approx(np.mean(each), abs=1e-6)
+    assert metrics.mean_average_precision(torch.eye(30), torch.eye(30)[objects * 3], objects) > 0.3
+    assert metrics.mean_average_precision(torch.eye(30)[objects], torch.eye(30)[objects], objects) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("method", "least"), [("CCA", 0.99), ("PLSCA", 0.4)])  # PLS is drawn to what varies most
@@ -88,13 +82,10 @@ def test_what_two_views_share_is_found(method, least):
     shared = random(400, 4).double()
     one, other = (shared @ random(4, width, seed=width).double() for width in (12, 8))
     pairs, rows = (one[:200], other[:200]), torch.arange(200)
-    found = correlated(method, pairs, one[200:], other[200:], components=4)
-    assert mean_average_precision(*found, rows) > least
-    strange = correlated(method, pairs, one[200:], random(200, 8, seed=3), components=4)
-    assert mean_average_precision(*strange, rows) < 0.1
-
-
-# Distances ------------------------------------------------------------------------------------------------------------
+    found = metrics.correlated(method, pairs, one[200:], other[200:], components=4)
+    assert metrics.mean_average_precision(*found, rows) > least
+    strange = metrics.correlated(method, pairs, one[200:], random(200, 8, seed=3), components=4)
+    assert metrics.mean_average_precision(*strange, rows) < 0.1
 
 
 def test_the_distance_of_gaussians_is_that_of_their_moments():
@@ -103,8 +94,8 @@ def test_the_distance_of_gaussians_is_that_of_their_moments():
     white = seen @ torch.linalg.inv(torch.linalg.cholesky(torch.cov(seen.T))).T  # deviation 1, uncorrelated
     scale, shift = torch.tensor([1.0, 2.0, 0.5]).double(), torch.tensor([0.0, 1.0, -2.0]).double()
     expected = (shift**2).sum() + ((scale - 1.0) ** 2).sum()
-    assert frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
-    assert frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)
+    assert metrics.frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
+    assert metrics.frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)
 
 
 # Probes ---------------------------------------------------------------------------------------------------------------
@@ -117,10 +108,9 @@ def clouds(count: int, spread: float, seed: int) -> tuple[torch.Tensor, torch.Te
 
 
 def test_classes_apart_are_all_told_and_noise_is_not():
-    (train, fitted), (val, chosen), (test, known) = (clouds(60, 0.05, seed) for seed in range(3))
-    assert share_right(linear_probe(train, fitted, val, chosen, test), known) == 1.0
-    (train, fitted), (val, chosen), (test, known) = (clouds(600, 100.0, seed) for seed in range(3))
-    assert share_right(linear_probe(train, fitted, val, chosen, test), known) == pytest.approx(1 / 3, abs=0.07)
+    for count, spread, share in ((60, 0.05, 1.0), (600, 100.0, pytest.approx(1 / 3, abs=0.07))):
+        (train, fitted), (val, chosen), (test, known) = (clouds(count, spread, seed) for seed in range(3))
+        assert metrics.share_right(metrics.linear_probe(train, fitted, val, chosen, test), known) == share
 
 
 def test_the_validation_split_chooses_the_penalty():
@@ -128,4 +118,4 @@ def test_the_validation_split_chooses_the_penalty():
     (train, fitted), (val, chosen), (test, known) = (clouds(90, 0.5, seed) for seed in range(3))
     leak = 3.0 * F.one_hot(fitted, 3)
     inputs = (torch.cat([train, leak], 1), fitted, torch.cat([val, torch.zeros(90, 3)], 1), chosen)
-    assert share_right(linear_probe(*inputs, torch.cat([test, torch.zeros(90, 3)], 1)), known) > 0.5
+    assert metrics.share_right(metrics.linear_probe(*inputs, torch.cat([test, torch.zeros(90, 3)], 1)), known) > 0.5

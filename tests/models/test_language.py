@@ -4,17 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch.testing import assert_close
-from transformers import (
-    AutoModelForCausalLM,
-    Gemma2Config,
-    GPT2Config,
-    LlamaConfig,
-    LlamaForCausalLM,
-    MixtralConfig,
-    Phi3Config,
-    Qwen2Config,
-    Qwen3Config,
-)  # fmt: skip
+from transformers import AutoConfig, AutoModelForCausalLM
 
 from tests.helpers.components import D
 from tests.helpers.language import SIZES, make_language_parts
@@ -30,6 +20,10 @@ MODES = {
     "several": {"do_sample": True, "num_return_sequences": 3}, "no cache": {"use_cache": False},
     "static cache": {"cache_implementation": "static"}, "guidance": {"guidance_scale": 2.0},
 }  # fmt: skip
+
+
+def model_of(kind, **sizes):
+    return AutoModelForCausalLM.from_config(AutoConfig.for_model(kind, **sizes)).eval()
 
 
 @pytest.fixture
@@ -96,15 +90,15 @@ def test_inputs_of_a_batch_get_what_each_gets_alone(parts, mode):
 @pytest.mark.parametrize(
     ("kind", "sizes"),
     [
-        (LlamaConfig, {"num_key_value_heads": 2, "head_dim": 12}), (Qwen2Config, {"num_key_value_heads": 2}),
-        (Qwen3Config, {"num_key_value_heads": 1, "head_dim": 8}), (Phi3Config, {"num_key_value_heads": 2}),
-        (Gemma2Config, {"num_key_value_heads": 2, "head_dim": 8}), (MixtralConfig, {"num_key_value_heads": 2}),
+        ("llama", {"num_key_value_heads": 2, "head_dim": 12}), ("qwen2", {"num_key_value_heads": 2}),
+        ("qwen3", {"num_key_value_heads": 1, "head_dim": 8}), ("phi3", {"num_key_value_heads": 2}),
+        ("gemma2", {"num_key_value_heads": 2, "head_dim": 8}), ("mixtral", {"num_key_value_heads": 2}),
     ],
 )  # fmt: skip
 @torch.no_grad()
 def test_any_attention_that_ends_in_o_proj_takes_a_bridge(kind, sizes):
     torch.manual_seed(0)
-    model = AutoModelForCausalLM.from_config(kind(**{**SIZES, **TOKENS, **sizes})).eval()
+    model = model_of(kind, **{**SIZES, **TOKENS, **sizes})
     bridge = LanguageBridge.for_model(model, D, intermediate_size=24).eval()
     before = model(IDS).logits
     with bridge.attach(model, EMBEDS):
@@ -132,10 +126,9 @@ def test_a_language_model_that_does_not_fit_and_adapters_out_of_range_are_refuse
         ({"num_hidden_layers": 3}, "`num_layers` 2, but the language model 3"),
         ({"hidden_size": 64, "head_dim": 8}, "`hidden_size` 32"), ({"num_attention_heads": 2}, "`num_heads` 4"),
     ):  # fmt: skip
-        other = LlamaForCausalLM(LlamaConfig(**{**SIZES, **TOKENS, **change}))
         with pytest.raises(InvalidInputError, match=words):
-            bridge.attach(other, EMBEDS)
+            bridge.attach(model_of("llama", **{**SIZES, **TOKENS, **change}), EMBEDS)
     with pytest.raises(InvalidInputError, match="GPT2LMHeadModel, whose attention has no `o_proj`"):
-        LanguageBridge.for_model(AutoModelForCausalLM.from_config(GPT2Config(n_layer=1, n_embd=32, n_head=4)), D)
+        LanguageBridge.for_model(model_of("gpt2", n_layer=1, n_embd=32, n_head=4), D)
     with pytest.raises(NonFiniteError, match="float32 or bfloat16"):
         bridge.attach(model, torch.full((1, D), torch.nan))

@@ -3,16 +3,9 @@
 import itertools
 import math
 
+import diffusers
 import pytest
 import torch
-from diffusers import (
-    DDIMScheduler,
-    DEISMultistepScheduler,
-    DPMSolverMultistepScheduler,
-    EulerDiscreteScheduler,
-    HeunDiscreteScheduler,
-    UniPCMultistepScheduler,
-)
 from scipy.integrate import quad
 
 from unitouch_gen.errors import NotConvergedError
@@ -29,11 +22,11 @@ MIXTURE, GAUSSIAN, GUIDED = PROBLEMS["mixture"], PROBLEMS["gaussian"], PROBLEMS[
 NOISE = MIXTURE.noise(3).float()
 KARRAS = {**STABLE_DIFFUSION, "use_karras_sigmas": True, "timestep_spacing": "linspace"}
 THEIRS = {
-    "euler": EulerDiscreteScheduler(**KARRAS),
-    "heun": HeunDiscreteScheduler(**KARRAS),
-    "dpm++2m": DPMSolverMultistepScheduler(**KARRAS, solver_order=2),
-    "unipc": UniPCMultistepScheduler(**KARRAS, solver_order=2, solver_type="bh2"),
-    "deis": DEISMultistepScheduler(**KARRAS, solver_order=2),
+    "euler": diffusers.EulerDiscreteScheduler(**KARRAS),
+    "heun": diffusers.HeunDiscreteScheduler(**KARRAS),
+    "dpm++2m": diffusers.DPMSolverMultistepScheduler(**KARRAS, solver_order=2),
+    "unipc": diffusers.UniPCMultistepScheduler(**KARRAS, solver_order=2, solver_type="bh2"),
+    "deis": diffusers.DEISMultistepScheduler(**KARRAS, solver_order=2),
 }
 
 
@@ -67,7 +60,7 @@ def test_steps_are_those_of_diffusers(name):
 
 @pytest.mark.parametrize(("eta", "steps"), [(0.0, 1), (0.0, 25), (0.5, 25), (1.0, 4)])
 def test_ddim_is_that_of_diffusers(eta, steps):
-    scheduler = DDIMScheduler(**STABLE_DIFFUSION, clip_sample=False, timestep_spacing="trailing")
+    scheduler = diffusers.DDIMScheduler(**STABLE_DIFFUSION, clip_sample=False, timestep_spacing="trailing")
     scheduler.set_timesteps(steps)
     z, network = NOISE, MIXTURE.network(3)
     for timestep in scheduler.timesteps:
