@@ -24,9 +24,6 @@ def test_every_embedding_gets_the_norm_and_keeps_its_direction_and_zero_stays_ze
         torch.testing.assert_close(match_norm(scale * EMBEDS.view(5, 1, D), 20.0), expected)
 
 
-# Noising --------------------------------------------------------------------------------------------------------------
-
-
 def test_noising_each_at_its_own_level_is_that_of_diffusers():
     pipe, levels = diffusers_pipeline(make_components()), torch.tensor([0, 1, 250, 500, 999])
     found = noise_embeddings(EMBEDS, levels, NOISE, pipe.image_normalizer, pipe.image_noising_scheduler)
@@ -45,9 +42,6 @@ def test_signal_and_noise_have_the_shares_of_the_schedule(level, signal, sigma):
         found = noise_embeddings(*inputs)
         assert found.dtype == dtype
     torch.testing.assert_close(found[:, :D], signal * unit + sigma * NOISE, atol=5e-3, rtol=0)
-
-
-# The bridge -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -56,9 +56,6 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
     return float((found - wanted).norm() / wanted.norm())
 
 
-# Embeddings -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_embeddings_are_those_of_the_published_networks(networks, model, modality):
     values = inputs_of(sizes())[modality]

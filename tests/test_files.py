@@ -18,9 +18,6 @@ def names(folder: Path) -> set[str]:
     return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
-
-
 def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
     file = write_file("output", tmp_path / "new" / "a.txt", "old")
     with replacing("output", file) as partial:
@@ -75,9 +72,6 @@ def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
         process.kill()
         process.communicate()
         assert (tmp_path / "model" / "a").read_text() == (tmp_path / "model" / "b").read_text() != ""
-
-
-# Reading --------------------------------------------------------------------------------------------------------------
 
 
 def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_stays(tmp_path):

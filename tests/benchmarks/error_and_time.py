@@ -44,9 +44,6 @@ def held_out(name: str, pipe: Any, conditions: int) -> dict[str, Any]:
     return {"touch_embeds": embeds}
 
 
-# The usual way --------------------------------------------------------------------------------------------------------
-
-
 def usual_way(pipe: Any) -> Callable[..., Any]:
     """diffusers' DDIM: calls of diffusers' own pipeline of the same parts, which has none of touches, or of ours."""
     _, ddim = BASELINES["diffusers:ddim"]
@@ -78,9 +75,6 @@ def usual_way(pipe: Any) -> Callable[..., Any]:
     return call
 
 
-# Four evaluations -----------------------------------------------------------------------------------------------------
-
-
 def turbo_figures(batches: Sequence[int] = (1, 32), repeats: int = 3) -> Figures:
     """Seconds a sample of whole calls, encoding and decoding included, and speed-ups, by pipeline and batch size: over
     diffusers' DDIM in 50 steps at guidance 9, and over the default call."""
@@ -100,9 +94,6 @@ def turbo_figures(batches: Sequence[int] = (1, 32), repeats: int = 3) -> Figures
             ratios = {f"over {who}": ratio_of(seen[who], seen["turbo"]) for who in ("ddim", "default")}
             figures[f"{of}, {size} at once"] = {"seconds": seconds, **ratios}
     return figures
-
-
-# What an error costs --------------------------------------------------------------------------------------------------
 
 
 def cost_figures(

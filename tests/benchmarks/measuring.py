@@ -32,9 +32,6 @@ def quiet(name: str, **settings: Any) -> Any:
     return pipe
 
 
-# Time -----------------------------------------------------------------------------------------------------------------
-
-
 def in_turns(calls: Mapping[Name, Callable[[], Seen]], repeats: int) -> dict[Name, list[Seen]]:
     """What calls return that take turns, so that a busy spell of the machine hits all; a first turn is not kept."""
     turns = [{name: call() for name, call in calls.items()} for _ in range(repeats + 1)]
@@ -52,9 +49,6 @@ def ratio_of(slow: Sequence[float], fast: Sequence[float]) -> dict[str, float]:
     """How many times as long `slow` took as `fast`: ratio of the medians, and the least and largest of the turns."""
     turns = [high / low for high, low in zip(slow, fast, strict=True)]
     return {"ratio": statistics.median(slow) / statistics.median(fast), "low": min(turns), "high": max(turns)}
-
-
-# What is read of contacts ---------------------------------------------------------------------------------------------
 
 
 def cross_predicted(features: Tensor, targets: Tensor, groups: Tensor) -> Tensor:

@@ -24,9 +24,6 @@ from unitouch_gen.world.scene import MODALITIES
 pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
 
 
-# Error and time -------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def pipe():
     made = TouchToImagePipeline(**make_components(), default_num_inference_steps=3, default_guidance_scale=2.0)
@@ -53,9 +50,6 @@ def test_the_usual_way_makes_the_same_latents_from_the_same_start(pipe):
 def test_costs_are_the_fewest_evaluations_within_an_error(pipe):
     costs = cost_figures(pipe, INPUTS, (2.0, 1e-9), steps=(4, 8), seeds=1, rtol=0.3)["cost_at_error"]
     assert {error: row["steps"] for error, row in costs.items()} == {"2": 4}
-
-
-# The world ------------------------------------------------------------------------------------------------------------
 
 
 def test_finer_touches_are_nearer_to_the_finest() -> None:
@@ -86,17 +80,11 @@ def test_each_request_does_less_than_everything() -> None:
     assert max(counts.values()) < 0.9 * everything and counts["text",] < 0.01 * everything
 
 
-# Models ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_built_in_joint_space_is_beside_its_controls(tmp_path):
     words = ["--joint", str(weights.JOINT), "--seeds", "1", "--objects", "2"]
     rows = quality.measure(quality.arguments(words), tmp_path)["rows"]
     assert rows["touch: material"]["value"] > rows["touch: material"]["shuffled"]
-
-
-# Pages ----------------------------------------------------------------------------------------------------------------
 
 
 def test_stored_figures_fill_the_marks_of_all_pages_and_the_cards(tmp_path):

@@ -23,9 +23,6 @@ COUNT = len(MATERIAL_NAMES)
 CHUNK = 32
 """Samples that a process renders at once."""
 
-# Time -----------------------------------------------------------------------------------------------------------------
-
-
 def world_figures(samples: int = 512) -> Figures:
     """Full samples a second of two processes: picture, touch of two drawn sensors, sound and caption at 128 pixels."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -43,8 +40,6 @@ def _render_many(first: int) -> int:
         world.render(rows % COUNT, rows // COUNT, rows * 0, sensors=sensors)
     return CHUNK
 
-
-# Error ----------------------------------------------------------------------------------------------------------------
 
 OBJECT = 10
 """Of which each contact is of another material."""

@@ -115,9 +115,6 @@ def test_an_interrupt_ends_with_130(here, models):
     assert child.wait() == 130 and child.err == "unitouch-gen: stopped; what is written is whole.\n"
 
 
-# Help -----------------------------------------------------------------------------------------------------------------
-
-
 def found(command: Any = None, name: str = "unitouch-gen") -> Iterator[tuple[str, Any]]:
     """Every command, by the words that call it."""
     command = command or typer.main.get_command(commands)

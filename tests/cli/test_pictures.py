@@ -37,9 +37,6 @@ def same(file: str | Path, other: str | Path, tolerance: int = 1) -> bool:
     return abs(pixels(file) - pixels(other)).max() <= tolerance
 
 
-# The pictures ---------------------------------------------------------------------------------------------------------
-
-
 def test_pictures_are_those_of_the_pipeline(here, run, pipes):
     words = "--steps 4 --guidance 1.5 --sensor digit --strength 0.5 --negative-prompt wood --noise-level 30"
     settings = "--solver ddim --set height=24 --set eta=0.5"
@@ -93,9 +90,6 @@ def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
     assert same("weighed.png", "text.png", tolerance=0)
 
 
-# Inputs ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "stems"),
     [
@@ -118,9 +112,6 @@ def test_words_stand_for_files(here, run, words, stems):
         recordings.write(here / "in" / "press.mp4", list(recordings.frames()))
     rows = run(f"touch-to-image {words} -o out")["pictures"]
     assert [Path(row["picture"]).stem for row in rows] == stems
-
-
-# Files, and what is printed -------------------------------------------------------------------------------------------
 
 
 def test_text_says_where_pictures_are_and_overwrite_replaces_them(here, command, models):

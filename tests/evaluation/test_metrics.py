@@ -16,9 +16,6 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-# Controls -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [2, 3, 64])
 def test_others_are_each_sample_once_and_never_the_same_one(count):
     rows = others(count)
@@ -53,9 +50,6 @@ def test_statistics_tell_how_strong_and_how_fine_a_change_is():
     assert not nothing.any()
     np.testing.assert_allclose(twice, 2 * one)
     assert one[0] == pytest.approx(1.0)  # the mean gradient
-
-
-# Retrieval ------------------------------------------------------------------------------------------------------------
 
 
 def test_others_of_the_class_are_those_of_all_draws():
@@ -96,9 +90,6 @@ def test_the_distance_of_gaussians_is_that_of_their_moments():
     expected = (shift**2).sum() + ((scale - 1.0) ** 2).sum()
     assert metrics.frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
     assert metrics.frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)
-
-
-# Probes ---------------------------------------------------------------------------------------------------------------
 
 
 def clouds(count: int, spread: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -88,9 +88,6 @@ def sloping() -> ContactClassifier:
     return ContactClassifier(config).eval()
 
 
-# What is generated ----------------------------------------------------------------------------------------------------
-
-
 def test_of_real_images_every_measure_is_its_best(splits):
     judges = {"image": sloping(), "touch": sloping()}
     rows = torch.arange(0, COUNT, 5)

@@ -63,6 +63,17 @@ def test_a_list_of_many_kinds_is_one_batch_in_order(processor: UniTouchProcessor
     torch.testing.assert_close(batch[2:], pixels_of(PICTURE / 255).expand(3, -1, -1, -1), rtol=0, atol=1e-6)
 
 
+def test_squares_are_those_of_clips_processor(processor: UniTouchProcessor) -> None:
+    clip = CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size=32)
+    for height, width in ((48, 80), (100, 151), (97, 32), (300, 225), (20, 31), (33, 32), (16, 600)):
+        picture = smooth(height, width)
+        reference = denormalise_pixels(clip(Image.fromarray(picture), return_tensors="pt").pixel_values)
+        for given in (picture, picture / 255):
+            values = processor.images(given)
+            torch.testing.assert_close(denormalise_pixels(values), reference, rtol=0, atol=2 / 255)
+            torch.testing.assert_close(normalise_pixels(denormalise_pixels(values)), values, rtol=1e-5, atol=1e-5)
+
+
 # PIL modes ------------------------------------------------------------------------------------------------------------
 
 
@@ -175,20 +186,6 @@ def test_a_camera_held_sideways_is_turned_back(processor: UniTouchProcessor, tmp
         Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "turned.png", exif=exif)
         found = processor.raw_images(tmp_path / "turned.png")
         torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
-
-
-# Squares and normalisation --------------------------------------------------------------------------------------------
-
-
-def test_squares_are_those_of_clips_processor(processor: UniTouchProcessor) -> None:
-    clip = CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size=32)
-    for height, width in ((48, 80), (100, 151), (97, 32), (300, 225), (20, 31), (33, 32), (16, 600)):
-        picture = smooth(height, width)
-        reference = denormalise_pixels(clip(Image.fromarray(picture), return_tensors="pt").pixel_values)
-        for given in (picture, picture / 255):
-            values = processor.images(given)
-            torch.testing.assert_close(denormalise_pixels(values), reference, rtol=0, atol=2 / 255)
-            torch.testing.assert_close(normalise_pixels(denormalise_pixels(values)), values, rtol=1e-5, atol=1e-5)
 
 
 # What is no picture ---------------------------------------------------------------------------------------------------

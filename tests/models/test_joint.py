@@ -62,9 +62,6 @@ def test_audio_features_are_the_mean_of_normalised_clips(model: UniTouchModel, i
     torch.testing.assert_close(model.get_audio_features(clips), (each[0] + each[1]) / 2)
 
 
-# Touch and its sensors ------------------------------------------------------------------------------------------------
-
-
 def test_touch_features_are_the_trunk_with_the_sensors_tokens(model: UniTouchModel, inputs: dict) -> None:
     pixels, ids = inputs["touch"]["pixel_values"], torch.tensor([2, 0])
     expected = model.touch_model(pixels, model.sensor_bank.tokens[ids])
@@ -115,9 +112,6 @@ def test_a_model_of_some_modalities_is_saved_with_those(config: UniTouchConfig, 
     again = UniTouchModel.from_pretrained(tmp_path)
     with pytest.raises(InvalidInputError, match="no image encoder; it has text, touch"):
         again.load("image")
-
-
-# dtype and device -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.*copying from a non-meta parameter")

@@ -126,9 +126,6 @@ def test_half_precision_errs_by_less_than_with_a_rounded_sum() -> None:
     assert errors[1] < 0.7 * errors[0] < 0.02
 
 
-# The paper's size, by configuration alone -----------------------------------------------------------------------------
-
-
 def test_the_default_encoders_have_the_published_sizes_and_shapes() -> None:
     with torch.device("meta"):
         paper = UniTouchModel(UniTouchConfig(sensors=["gelsight", "digit", "taxim"])).eval()
@@ -146,8 +143,6 @@ def test_the_default_encoders_have_the_published_sizes_and_shapes() -> None:
     assert millions(paper.audio_model) == pytest.approx(86.2, abs=0.05)
     assert paper.sensor_bank.tokens.shape == (3, 5, 1024)
 
-
-# CLIP's vision tower behind convolutions ------------------------------------------------------------------------------
 
 SIZES = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 32,
          "patch_size": 8, "projection_dim": 16}  # fmt: skip

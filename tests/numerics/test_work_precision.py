@@ -89,9 +89,6 @@ def test_a_distilled_network_runs_in_few_steps_without_guidance():
     assert measure(guided, "turbo", 4, repeats=1)["evaluations"] == 4
 
 
-# What the rows say ----------------------------------------------------------------------------------------------------
-
-
 def row(steps: int = 10, error: float = 0.01, solver: str = "heun", **values) -> dict:
     known = {"tolerance": None, "error_low": error, "error_high": error, "evaluations": steps, "seconds": steps / 100}
     return {"solver": solver, "steps": steps, "error": error, "failures": 0, "default": False, **known, **values}
