@@ -23,6 +23,7 @@ COUNT = len(MATERIAL_NAMES)
 CHUNK = 32
 """Samples that a process renders at once."""
 
+
 def world_figures(samples: int = 512) -> Figures:
     """Full samples a second of two processes: picture, touch of two drawn sensors, sound and caption at 128 pixels."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -41,28 +42,17 @@ def _render_many(first: int) -> int:
     return CHUNK
 
 
-OBJECT = 10
-"""Of which each contact is of another material."""
-
-REFINEMENTS = (1, 2)
-
-
 @torch.no_grad()
-def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
-    """Median error, seconds a contact and order of touch images, by how finely they are rendered."""
-    index = torch.arange(contacts)
-    draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
-    flat = {"shape": 0 * index, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
-    return {"touch of gelsight": touch_accuracy(draws.but(**flat), repeats)}  # a rim falls between pixels
+def physics_figures(contacts: int = 16, repeats: int = 3, refinements: tuple[int, ...] = (1, 2)) -> Figures:
+    """Median error, seconds a contact and order of GelSight's touch images, by how finely they are rendered.
 
-
-def touch_accuracy(draws: Draws, repeats: int) -> Figures:
-    """Error of GelSight's images relative to what the contact changes in that of the untouched gel.
-
-    A contact's surface is a function of position that a finer rendering samples more often, so both show the same
-    contact. Surface, gel and image are refined together, and finer images averaged down; the reference is four times
-    as fine as the finest.
+    Errors are relative to what the contact changes in the image of the untouched gel. A contact's surface is a function
+    of position that a finer rendering samples more often, so both show the same contact. Surface, gel and image are
+    refined together, and finer images averaged down; the reference is four times as fine as the finest.
     """
+    index = torch.arange(contacts)
+    draws = draw(0, index % COUNT, torch.full_like(index, 10), index)  # each contact is of another material
+    draws = draws.but(shape=0 * index, scale=torch.ones(contacts), tilt=0.0 * draws.tilt)  # rims fall between pixels
     sensor, world = replace(SENSORS["gelsight"], contact_steps=0), World()  # which is the equation that converges
     side = world.image_size
 
@@ -71,16 +61,14 @@ def touch_accuracy(draws: Draws, repeats: int) -> Figures:
         height = surfaces(0, part, finer * world.resolution, coloured=False).height
         return F.avg_pool2d(touch_images(height, part.indentation_depth, part.dwell, sensor, finer * side), finer)
 
-    finest = 4 * REFINEMENTS[-1]
-    exact = torch.cat([touches(finest, slice(row, row + 1)) for row in range(len(draws))])  # each surface is megabytes
+    finest = 4 * refinements[-1]
+    exact = torch.cat([touches(finest, slice(row, row + 1)) for row in range(contacts)])  # each surface is megabytes
     untouched = F.avg_pool2d(untouched_gel(sensor, finest * side), finest)
     scale = (exact - untouched).square().mean(dim=(1, 2, 3)).sqrt()
-    calls = {f"{k}x": partial(touches, k) for k in REFINEMENTS}
-    errors = {
-        name: ((call() - exact).square().mean(dim=(1, 2, 3)).sqrt() / scale).numpy() for name, call in calls.items()
-    }
+    calls = {f"{k}x": partial(touches, k) for k in refinements}
+    errors = {name: (call() - exact).square().mean(dim=(1, 2, 3)).sqrt() / scale for name, call in calls.items()}
     medians = {name: float(np.median(found)) for name, found in errors.items()}
-    spacings = [1 / k for k in REFINEMENTS]
-    order = float(np.polyfit(np.log(spacings), np.log(list(medians.values())), 1)[0])
+    order = float(np.polyfit(np.log([1 / k for k in refinements]), np.log(list(medians.values())), 1)[0])
     seen = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
-    return {name: {"error": medians[name], "seconds": min(seen[name]) / len(draws), "order": order} for name in calls}
+    found = {name: {"error": medians[name], "seconds": min(seen[name]) / contacts, "order": order} for name in calls}
+    return {"touch of gelsight": found}
