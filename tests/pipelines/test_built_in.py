@@ -1,9 +1,10 @@
-"""The built-in family as pipelines: what it is made of, how it is read, and steps to a tolerance."""
+"""The built-in family as pipelines: what it is made of, how it is read, steps to a tolerance, four evaluations."""
 
 import shutil
 
 import pytest
 import torch
+from diffusers import LCMScheduler
 from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
@@ -32,6 +33,7 @@ def test_a_call_without_options_has_the_checkpoints_defaults_and_128_pixels(call
 
 def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_level() -> None:
     pictures, restyled = (unitouch_gen.tiny(name) for name in ("touch-to-image", "stylization"))
+    assert pictures.text_encoder is pictures.unitouch.text_model.text_model
     assert pictures.embedding_bank is None and restyled.embedding_bank is not None
     assert pictures.config.default_noise_level < restyled.config.default_noise_level
     weights = zip(pictures.unet.parameters(), restyled.unet.parameters(), strict=True)
@@ -43,17 +45,6 @@ def test_a_tolerance_is_kept(call):
     found, reference = call(tolerance=0.1, output_type="latent"), call.latents(solver="dpm++2m", num_inference_steps=30)
     assert (found.images - reference).norm() / reference.norm() < 0.12
     assert found.report.evaluations < 40 and found.report.solver == "adaptive"
-
-
-def test_diffusers_own_pipeline_makes_the_same_picture():
-    pipe = quiet(unitouch_gen.tiny("touch-to-image"))
-    assert pipe.text_encoder is pipe.unitouch.text_model.text_model
-    embeds = pipe.encode_touch(unitouch_gen.example("brick"))
-    options = {"prompt": "metal", "num_inference_steps": 3, "guidance_scale": 3.0}
-    options |= {"noise_level": 250, "output_type": "pt"}
-    found = pipe(touch_embeds=embeds, generator=seeded(), **options).images
-    expected = quiet(pipe.to_diffusers())(image_embeds=embeds, generator=seeded(), **options).images
-    assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_path):
@@ -86,3 +77,62 @@ def test_answers_name_what_was_touched_or_seen():
     touches = pipe([unitouch_gen.example(name) for name in names], "What is it?")
     assert touches.texts == [f"it is {name}." for name in names] and len(touches.report.tokens) == 3
     assert pipe(image=unitouch_gen.example("wood", "image"), question="What is it?").texts == ["it is wood."]
+
+
+# In four evaluations: LoRA weights under diffusers' `LCMScheduler` ---------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def family(tmp_path_factory):
+    peft, folder = pytest.importorskip("peft", reason="LoRA needs peft"), tmp_path_factory.mktemp("family")
+    torch.manual_seed(0)
+    write_small_family(folder)
+    for name in TURBO.values():
+        pipe = unitouch_gen.tiny(name, family=folder)
+        pipe.unet.add_adapter(peft.LoraConfig(r=2, target_modules=["to_q", "conv1"], init_lora_weights=False))
+        layers = peft.get_peft_model_state_dict(pipe.unet, adapter_name="default")
+        pipe.save_lora_weights(folder / name / "turbo", unet_lora_layers=layers)
+    return folder
+
+
+@pytest.fixture(params=TURBO)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def turbo(name, family):
+    return quiet(unitouch_gen.tiny(name, family=family))
+
+
+def draw(pipe, name, count=1, **options):
+    inputs = {"touch" if TURBO[name] == "touch-to-image" else "image": torch.rand(2, 3, 128, 128, generator=seeded())}
+    call = Call(pipe, {**inputs, "sensor": "digit", "output_type": "latent"})
+    return (call.one(0) if count == 1 else call)(**options)
+
+
+def test_it_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo, name):
+    output = draw(turbo, name)
+    assert (output.report.evaluations, output.report.guided) == (4, 0)
+    assert "unconditional branch" in output.report.left_out
+    for steps in (2, 8):
+        assert draw(turbo, name, num_inference_steps=steps).report.evaluations == steps
+    assert draw(turbo, name, guidance_scale=2.0).report.guided == 4
+
+
+def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo, name, family):
+    pipe = quiet(unitouch_gen.tiny(TURBO[name], family=family))
+    pipe.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
+    plain = draw(pipe, name, num_inference_steps=4, guidance_scale=1.0).images
+    pipe.load_lora_weights(family / TURBO[name] / "turbo")
+    expected = draw(pipe, name, num_inference_steps=4, guidance_scale=1.0).images
+    assert_close(draw(turbo, name).images, expected, atol=1e-4, rtol=1e-3)
+    assert not torch.allclose(expected, plain, atol=1e-2)
+
+
+def test_the_noise_of_each_step_is_of_each_pictures_own_generator(turbo, name):
+    both = draw(turbo, name, 2, generator=[seeded(0), seeded(1)]).images
+    assert_close(both[:1], draw(turbo, name, generator=seeded(0)).images, atol=1e-4, rtol=1e-3)
+    noise = {"latents": torch.randn(1, *both.shape[1:])}
+    first, second = (draw(turbo, name, **noise, generator=seeded(seed)).images for seed in (0, 1))
+    assert not torch.allclose(first, second, atol=1e-2)
