@@ -67,6 +67,8 @@ def test_touch_features_are_the_trunk_with_the_sensors_tokens(model: UniTouchMod
     expected = model.touch_model(pixels, model.sensor_bank.tokens[ids])
     torch.testing.assert_close(model.get_touch_features(pixels, ids.to(torch.uint8)), expected)
     assert not torch.allclose(model.get_touch_features(pixels, torch.tensor([1, 1])), expected, atol=1e-3)
+    expected[1] = model.touch_model(pixels)[1]  # of no sensor
+    torch.testing.assert_close(model.get_touch_features(pixels, torch.tensor([2, -1])), expected)
 
 
 # Encoders on demand ---------------------------------------------------------------------------------------------------

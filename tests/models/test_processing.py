@@ -36,10 +36,13 @@ def test_a_tokenizer_that_cannot_pad_is_refused(tokenizer: CLIPTokenizer) -> Non
 
 
 def test_settings_that_cannot_be_used_are_refused_by_name() -> None:
+    audio = {"sampling_rate": 0, "clip_seconds": 0.0, "clips": 0, "frames": "204", "std": 0.0, "frame_length": 1e-5,
+             "frame_shift": 0.0, "mean": float("inf")}  # fmt: skip
     for settings, words in (
         ({"image_size": 10**9}, "`image_size` is 1000000000"), ({"image_size": 32.0}, "`image_size` is 32.0"),
         ({"audio": {"frames": 10**12}}, "`frames` is 1000000000000"), ({"audio": [16_000]}, "`audio` is a list"),
         ({"tokenizer": "clip"}, "`tokenizer` is 'clip'"),
+        *(({"audio": {name: value}}, f"`{name}` is ") for name, value in audio.items()),
     ):  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
             UniTouchProcessor(**settings)

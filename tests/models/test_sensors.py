@@ -10,14 +10,6 @@ from unitouch_gen.models import SensorBank, SensorMatch
 NAMES = ("gelsight", "digit", "taxim")
 
 
-def filled(size: int = 8) -> SensorBank:
-    torch.manual_seed(0)
-    bank = SensorBank(NAMES, 5, 16, size)
-    for name in NAMES:
-        bank.set_prototype(name, torch.rand(3, size, size))
-    return bank
-
-
 def reaching(**reaches: float) -> SensorBank:
     """Two sensors with flat looks, 0.2 and 0.8, and how far their touches lie."""
     bank = SensorBank(tuple(reaches), 5, 16, 32, reaches=reaches)
@@ -31,7 +23,10 @@ def levels(*values: float) -> torch.Tensor:
 
 
 def test_retrieval_is_the_smallest_mean_absolute_difference() -> None:
-    bank, images = filled(), torch.rand(20, 3, 8, 8)
+    torch.manual_seed(0)
+    bank, images = SensorBank(NAMES, 5, 16, 8), torch.rand(20, 3, 8, 8)
+    for name in NAMES:
+        bank.set_prototype(name, torch.rand(3, 8, 8))
     gaps = np.abs(images.numpy()[:, None] - torch.stack([bank.prototype(name) for name in NAMES]).numpy()[None])
     distances = gaps.reshape(20, 3, -1).mean(axis=2)
     np.testing.assert_allclose(bank.distances(images), distances, rtol=1e-5)
@@ -68,13 +63,3 @@ def test_reaches_are_of_areas_and_the_sensor_whose_own_touches_lie_as_far_is_ret
     assert reaching(dark=0.05, bright=0.4).match(levels(0.41))[0].name == "bright"  # nearer to the dark one
     checks = 0.2 + 0.2 * (-1.0) ** (torch.arange(32)[:, None] + torch.arange(32)).expand(1, 3, 32, 32)
     assert reaching(dark=0.01, bright=0.01).match(checks)[0].name == "dark"
-
-
-def test_each_row_gets_the_tokens_of_its_sensor() -> None:
-    def summed(pixels: torch.Tensor, prefix: torch.Tensor | None = None) -> torch.Tensor:
-        return pixels if prefix is None else pixels + prefix.sum(dim=(1, 2))[:, None]
-
-    bank, pixels = reaching(dark=0.05, bright=0.1), torch.arange(4.0)[:, None]
-    tokens = bank.tokens.sum(dim=(1, 2))
-    expected = pixels + torch.stack([tokens[1], torch.zeros(()), tokens[0], tokens[1]])[:, None]
-    torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0, 1])), expected)
