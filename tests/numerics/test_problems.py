@@ -13,7 +13,7 @@ from unitouch_gen.numerics.problems import PROBLEMS, GaussianMixture, Problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.schedule import PREDICTION_TYPES, alpha, to_denoised
 
-GAUSSIAN, MIXTURE, GUIDED = PROBLEMS["gaussian"], PROBLEMS["mixture"], PROBLEMS["gaussian-guided"]
+MIXTURE, GUIDED = PROBLEMS["mixture"], PROBLEMS["gaussian-guided"]
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:

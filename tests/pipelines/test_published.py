@@ -79,21 +79,17 @@ def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, mo
     assert {"image_encoder/*", "*.fp16.*"} < set(unclip["ignore_patterns"])
 
 
-@pytest.mark.parametrize(
-    ("unclip", "joint", "options", "named"),
-    [("./gone", "joint", {}, "unclip"), ("unclip", "../gone", {}, "unitouch"), ("joint", "joint", {}, "unclip"),
-     ("unclip", "unclip", {}, "unitouch"), ("pickled", "joint", {}, "unclip"), ("broken", "joint", {}, "unclip"),
-     ("unclip", "narrow", {}, "unitouch"), ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
-     ],
-)  # fmt: skip
-def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path, unclip, joint, options, named):
-    places = dict(parts)
-    if unclip in ("pickled", "broken"):
-        places[unclip] = shutil.copytree(parts["unclip"], tmp_path / unclip)
-        file = places[unclip] / "unet" / "diffusion_pytorch_model.safetensors"
+def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path):
+    places = {**parts, "narrow": converted(tmp_path, width=24, imagebind=False)}
+    for kind in ("pickled", "broken"):
+        places[kind] = shutil.copytree(parts["unclip"], tmp_path / kind)
+        file = places[kind] / "unet" / "diffusion_pytorch_model.safetensors"
         torch.save({}, file.with_suffix(".bin"))
-        file.unlink() if unclip == "pickled" else file.write_bytes(file.read_bytes()[:-500])
-    if joint == "narrow":
-        places[joint] = converted(tmp_path, width=24, imagebind=False)
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
-        to_image(places.get(unclip, unclip), places.get(joint, joint), **options)
+        file.unlink() if kind == "pickled" else file.write_bytes(file.read_bytes()[:-500])
+    for unclip, joint, options, named in (
+        ("./gone", "joint", {}, "unclip"), ("unclip", "../gone", {}, "unitouch"), ("joint", "joint", {}, "unclip"),
+        ("unclip", "unclip", {}, "unitouch"), ("pickled", "joint", {}, "unclip"), ("broken", "joint", {}, "unclip"),
+        ("unclip", "narrow", {}, "unitouch"), ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
+    ):  # fmt: skip
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
+            to_image(places.get(unclip, unclip), places.get(joint, joint), **options)

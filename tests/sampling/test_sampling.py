@@ -17,7 +17,7 @@ from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import DIVERGED_RMS, SOLVERS, ReturnCode, RunReport, prepare_steps, sample
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
-PLAIN, GUIDED, MIXTURE = PROBLEMS["conditioning-1e2"], PROBLEMS["gaussian-guided"], PROBLEMS["mixture-3"]
+PLAIN, GUIDED = PROBLEMS["conditioning-1e2"], PROBLEMS["gaussian-guided"]
 NAN = math.nan
 OWN = PLAIN.scheduler()
 

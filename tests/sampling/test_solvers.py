@@ -18,7 +18,7 @@ from unitouch_gen.solvers import SOLVERS, denoised_at_zero, exponential_integral
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
 
-MIXTURE, GAUSSIAN, GUIDED = PROBLEMS["mixture"], PROBLEMS["gaussian"], PROBLEMS["gaussian-guided"]
+MIXTURE, GAUSSIAN = PROBLEMS["mixture"], PROBLEMS["gaussian"]
 NOISE = MIXTURE.noise(3).float()
 KARRAS = {**STABLE_DIFFUSION, "use_karras_sigmas": True, "timestep_spacing": "linspace"}
 THEIRS = {

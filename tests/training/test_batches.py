@@ -91,10 +91,7 @@ def blurred(image: Tensor) -> list[Tensor]:
     ("augment", "candidates"),
     [
         (lambda images: batches.shift_pixels(images, 2), moved),
-        (
-            lambda images: batches.permute_channels(images, 1.0),
-            lambda i: [i[[*p]] for p in itertools.permutations(range(3))],
-        ),
+        (lambda images: batches.permute_channels(images, 1.0), lambda image: [image[[*p]] for p in PERMUTED]),
         (lambda images: batches.blur_some(images, 0.5), blurred),
         (lambda images: roll_in_time(images, 2), lambda clip: [clip[..., (TIME - d).clamp(0)] for d in range(3)]),
     ],

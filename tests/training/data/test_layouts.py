@@ -271,20 +271,16 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
         open_dataset(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_arguments_that_cannot_be_meant_are_refused(tmp_path: Path, monkeypatch) -> None:
+    table(tmp_path)
+    write(tmp_path, {"two/images_tac/image_1_tac.jpg": 1, "two/label.json": "{}"})
+    monkeypatch.chdir(tmp_path)
+    for arguments, message in (
         ({"path": "nowhere"}, "`path` is 'nowhere', which is not there"),
         ({"path": "labels.csv"}, "which is no folder; unpack it"),
         ({"path": "two"}, "looks like object_folder and ssvtp; say its `kind`"),
         ({"kind": "touch_and_goo"}, "`kind` is 'touch_and_goo'.*Did you mean 'touch_and_go'"),
         *(({name: 3}, f"`{name}` is 3") for name in ("path", "sensor", "materials")),
-    ],
-)  # fmt: skip
-def test_arguments_that_cannot_be_meant_are_refused(arguments: dict, message: str, tmp_path: Path, monkeypatch) -> None:
-    table(tmp_path)
-    (tmp_path / "empty").mkdir()
-    write(tmp_path, {"two/images_tac/image_1_tac.jpg": 1, "two/label.json": "{}"})
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
-        open_dataset(**{"path": tmp_path, **arguments})
+    ):
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
+            open_dataset(**{"path": tmp_path, **arguments})
