@@ -1,22 +1,18 @@
 """What a touch encoder does not know: the distance that is fitted, and where it is kept."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.distance import mahalanobis
 
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.abstention import fit_distance, fit_gaussians
-from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import save_modalities
 from unitouch_gen.training.touch import set_prototypes
 
 
-def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(
-    model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, tmp_path: Path
-) -> None:
+def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(model, processor, split, tmp_path):
     splits = [split, replace(split, sensor="gelsight", touch=split.second)]
     set_prototypes(model, splits, reaches=True)
     fit_distance(model, splits)
@@ -25,9 +21,8 @@ def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_enco
     save_modalities(model, ("touch",), processor, tmp_path / "touch")
     again = UniTouchModel.from_pretrained(tmp_path / "touch")
     assert [*again.config.ood_thresholds] == ["touch"]
-    assert (
-        set(again.config.sensor_reaches) == {"gelsight", "digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
-    )
+    reaches = again.config.sensor_reaches
+    assert set(reaches) == {"gelsight", "digit"} and 0.0 < reaches["digit"] < 0.3
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
         reasons = again.encode_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))[1]
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high

@@ -65,8 +65,6 @@ def test_a_batch_follows_from_the_number_of_its_step_and_the_seed(indices_of: Ca
 
 
 def test_batches_that_cannot_be_filled_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match=r"`sampler\.sigma` is 0\.75, with no other data set"):
-        in_batch_indices(0, [100], 16, SIGMA)
     with pytest.raises(InvalidInputError, match="`batch_size` is 64, but there are 5 samples"):
         shuffled_indices(0, 5, 64)
 

@@ -1,11 +1,12 @@
 """All stages, one after another as a person would run them, with two tiny steps each: from nothing to a picture."""
 
 import json
+import re
 import shutil
+import subprocess
 from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,11 +24,12 @@ from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.assemble import assemble
 from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import STAGES, Stage, run, weights_of
+from unitouch_gen.training.stages import STAGES, Stage, command_of, run, weights_of
 from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import MATERIAL_NAMES, World
 
+CHECKOUT = Path(__file__).resolve().parents[2]
 SHORT = (
     "data.drawn={sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=2",
     "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2",
@@ -39,15 +41,10 @@ VAE = tuple(f"model.{part}_block_out_channels=[8, 8, 8, 8]" for part in ("encode
 UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.attention_head_dim=1",
         "model.cross_attention_dim=16")  # fmt: skip
 RESNET = ("model.embedding_size=8", "model.hidden_sizes=[8]", "model.depths=[1]")
+SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 SETTINGS: dict[str, tuple[str, ...]] = {
-    "image_text": (
-        *ALONE,
-        "tokenizer.vocab_size=600",
-        "objective.views=1.0",
-        "sampler.sigma=0.75",
-        "sampler.group=2",
-        *(f"model.{key}={json.dumps(SPACE[key])}" for key in SPACE),
-    ),
+    "image_text": (*ALONE, *SPACED, "tokenizer.vocab_size=600", "objective.views=1.0", "sampler.sigma=0.75",
+                   "sampler.group=2"),
     "audio": (),
     "touch": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),
@@ -58,9 +55,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_classifier": (*ALONE, *RESNET),
     "language_model": ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("model.intermediate_size=24",),
-}
-
-
+}  # fmt: skip
 FROZEN = defaultdict(set, touch_llm={"language_model"})
 """Parts of an objective that are not trained."""
 
@@ -170,9 +165,7 @@ def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path,
     assert [*json.loads((family / "family.json").read_text())["training"]] == [*STAGES]
 
 
-def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_other_weights(
-    family: Path, runs: Path, tmp_path: Path
-) -> None:
+def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_other_weights(family, runs, tmp_path):
     shutil.copytree(runs, tmp_path / "runs", ignore=shutil.ignore_patterns("checkpoints", "cache", "family"))
     before = {path: path.read_bytes() for path in family.rglob("*") if path.is_file()}
     vae = tmp_path / "runs" / "image_vae"
@@ -200,9 +193,7 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
         Stage("touch", KINDS["touch"], **given)
 
 
-def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
-    joint: str, vae: str, monkeypatch: Any, capsys: Any, tmp_path: Path
-) -> None:
+def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, vae, monkeypatch, capsys, tmp_path):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     for name, words, message in (
@@ -215,7 +206,7 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
         ("touch_vae", "--set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
-        ("touch", "--joint {joint} --set data.drawn.sensors=[digit]", "`sampler.sigma` is 0.75"),
+        ("touch", "--joint {joint} --set data.drawn.sensors=[digit]", "sigma` is 0.75, with no other data set"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
     ):
@@ -224,3 +215,36 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
             run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
         (error,) = capsys.readouterr().err.splitlines()
         assert message in error and list((tmp_path / "here").iterdir()) == []
+
+
+def commands(runs: Path) -> list[str]:
+    """What `make weights` would run, without the interpreter's path and the cache."""
+    words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
+    done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
+    lines = done.stdout.replace("\\\n", " ").splitlines()
+    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training." in line]
+    return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
+
+
+def expected(stage: str, runs: Path) -> list[str]:
+    """Commands of a stage; pictures begin from captions alone, and touch from what it learns without pictures."""
+    whole = command_of(stage, runs)
+    if stage == "image_text":
+        captions, output = runs / "captions", whole.split(" --output ")[1]
+        first = f"python -m unitouch_gen.training.image_text --output {captions}"
+        begun = f"python -m unitouch_gen.training.image_text --recipe image_text_lamps --init {captions / 'model'}"
+        return [first, f"{begun} --output {output}"]
+    if stage != "touch":
+        return [whole]
+    start, output = whole.split(" --output ")
+    pairs = f"{start} --recipe touch_pairs --output {runs / 'touch_pairs'}"
+    return [pairs, f"{start} --init {runs / 'touch_pairs' / 'model'} --output {output}"]
+
+
+@pytest.mark.skipif(
+    not (CHECKOUT / "Makefile").is_file() or shutil.which("make") is None, reason="there is no checkout or no make"
+)
+def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
+    family = tmp_path / "family"
+    last = f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}"
+    assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]

@@ -42,9 +42,7 @@ def columns(folder: Path, cache: Path, processor: UniTouchProcessor, *needs: str
     return columns_of(config.sources(), cache, config, processor, needs)
 
 
-def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(
-    folder: Path, tmp_path: Path, processor: UniTouchProcessor
-) -> None:
+def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp_path, processor) -> None:
     needs = ("image", "touch", "audio", "text", "material", "sensor")
     written = columns(folder, tmp_path / "cache", processor, *needs, touch_size=24)
     files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")}
@@ -90,9 +88,7 @@ def test_embeddings_are_the_encoders_and_computed_once_for_its_weights(model: Un
     assert not torch.equal(image_embeddings(model, [pictures], "k", tmp_path), embeds)
 
 
-def test_broken_files_are_refused_in_a_list_and_leave_no_cache(
-    folder: Path, tmp_path: Path, processor: UniTouchProcessor
-) -> None:
+def test_broken_files_are_refused_in_a_list_and_leave_no_cache(folder, tmp_path, processor) -> None:
     for number in (3, 7, 11):
         (folder / f"touch{number}.png").write_bytes(b"\x89PNG")
     message = r"Data set 'mine' .*: 3 of 15 records cannot be read: .*touch3\.png.*touch7\.png.*touch11\.png"
@@ -102,9 +98,7 @@ def test_broken_files_are_refused_in_a_list_and_leave_no_cache(
 
 
 @pytest.mark.parametrize("need", ["image", "text", "material"])
-def test_what_a_record_lacks_is_named_before_anything_is_decoded(
-    need: str, folder: Path, tmp_path: Path, processor: UniTouchProcessor
-) -> None:
+def test_what_a_record_lacks_is_named_before_anything_is_decoded(need, folder, tmp_path, processor) -> None:
     cells = {"image": "picture4.png", "text": "n4", "material": "glass"}
     header, *rows = (folder / "labels.csv").read_text().splitlines()
     rows[4] = ",".join("" if cell == cells[need] else cell for cell in rows[4].split(","))

@@ -76,9 +76,7 @@ def test_a_fingerprint_is_of_one_world_and_names_its_cache() -> None:
     assert len({*prints, first.fingerprint("val")}) == 4 and prints[0] == prints[-1]
 
 
-def test_what_is_cached_is_mapped_and_the_same(
-    splits: list[Rendered], place: Path, processor: UniTouchProcessor, tmp_path: Path
-) -> None:
+def test_what_is_cached_is_mapped_and_the_same(splits, place, processor, tmp_path: Path) -> None:
     files = {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")}
     [again] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     assert {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")} == files
