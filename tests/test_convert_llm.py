@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from tests.helpers.language import make_language_parts
+from tests.helpers.components import make_language_parts
 from tests.helpers.touch_llm import DIM, HEADS, HIDDEN, LAYERS, WIDTH, files_of, logits_of
 from unitouch_gen.convert_llm import read_touch_llm
 from unitouch_gen.errors import InvalidInputError

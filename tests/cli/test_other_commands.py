@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers.components import make_components
-from tests.helpers.language import make_language_parts
+from tests.helpers.components import make_components, make_language_parts
 from tests.helpers.published import published, sizes
 from tests.helpers.touch_llm import files_of as touch_llm_files
 from unitouch_gen import example, weights
@@ -17,12 +16,7 @@ from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToTextPipeline
 from unitouch_gen.pipelines.tiny import joint_space
 
-built_in = pytest.mark.skipif(
-    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
-)
 
-
-@built_in
 def test_classify_says_what_the_library_says(command):
     labels = ["brick", "soft cloth", "a metal grid"]
     words = ("classify", "example:brick", "example:wood", "--labels", ",".join(labels), "--top", 2)

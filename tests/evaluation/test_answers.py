@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers.language import make_language_parts
+from tests.helpers.components import make_language_parts
 from unitouch_gen.evaluation.answers import attributes_of, caption_table, measured, rated
 from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.world import MATERIAL_NAMES, World
@@ -79,12 +79,8 @@ def test_a_class_that_is_rare_counts_as_much_as_others():
 
 
 def test_attributes_are_whole_words():
-    assert attributes_of("slightly rough red irregular brick, a rod") == {
-        "slightly rough",
-        "irregular",
-        "brick",
-        "a rod",
-    }
+    known = {"slightly rough", "irregular", "brick", "a rod"}
+    assert attributes_of("slightly rough red irregular brick, a rod") == known
     assert attributes_of("a coarseness of bricks") == set()
 
 

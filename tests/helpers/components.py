@@ -5,15 +5,16 @@ from typing import Any
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer, LlamaConfig, LlamaForCausalLM
 
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.training.language_model import train_language_tokenizer
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 D = 16
-
 
 AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
 CLIP = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2,
@@ -34,6 +35,8 @@ UNET = {"sample_size": 8, "block_out_channels": (8,), "layers_per_block": 1, "cr
         "attention_head_dim": 2, "norm_num_groups": 4}  # fmt: skip
 VAE = {"block_out_channels": (8, 8), "norm_num_groups": 4, "down_block_types": ("DownEncoderBlock2D",) * 2,
        "up_block_types": ("UpDecoderBlock2D",) * 2}  # fmt: skip
+LLAMA = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4,
+         "max_position_embeddings": 64, "tie_word_embeddings": True}  # fmt: skip
 
 
 def joint_config(tokenizer: CLIPTokenizer, **changes: Any) -> UniTouchConfig:
@@ -81,6 +84,17 @@ def make_x_to_touch() -> dict:
     unet = UNet2DConditionModel(**UNET, in_channels=3, out_channels=3, num_class_embeds=2)
     vae = VQModel(**VAE, latent_channels=3, num_vq_embeddings=32)
     return {"unet": unet.eval(), "vae": vae.eval(), "embedding_bank": EmbeddingBank.of(torch.randn(20, D)).eval()}
+
+
+def make_language_parts(**sizes: object) -> dict:
+    """Those of a `TouchToTextPipeline`: a small LLaMA and a bridge whose gates are open, so that answers differ."""
+    torch.manual_seed(0)
+    tokenizer = train_language_tokenizer(["How does it feel?\nit feels rough", "Where is it?"], 280)
+    special = {"vocab_size": len(tokenizer), "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
+    model = LlamaForCausalLM(LlamaConfig(**{**LLAMA, **special, "initializer_range": 0.3, **sizes})).eval()
+    bridge = LanguageBridge.for_model(model, D, num_blocks=2, intermediate_size=24).eval()
+    torch.nn.init.normal_(bridge.gates, std=2.0)
+    return {"language_bridge": bridge, "language_model": model, "tokenizer": tokenizer}
 
 
 def make_pipelines() -> dict[str, Any]:

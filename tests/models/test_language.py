@@ -6,8 +6,7 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 from transformers import AutoConfig, AutoModelForCausalLM
 
-from tests.helpers.components import D
-from tests.helpers.language import SIZES, make_language_parts
+from tests.helpers.components import LLAMA, D, make_language_parts
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models.language import LanguageBridge
 
@@ -98,7 +97,7 @@ def test_inputs_of_a_batch_get_what_each_gets_alone(parts, mode):
 @torch.no_grad()
 def test_any_attention_that_ends_in_o_proj_takes_a_bridge(kind, sizes):
     torch.manual_seed(0)
-    model = model_of(kind, **{**SIZES, **TOKENS, **sizes})
+    model = model_of(kind, **{**LLAMA, **TOKENS, **sizes})
     bridge = LanguageBridge.for_model(model, D, intermediate_size=24).eval()
     before = model(IDS).logits
     with bridge.attach(model, EMBEDS):
@@ -127,7 +126,7 @@ def test_a_language_model_that_does_not_fit_and_adapters_out_of_range_are_refuse
         ({"hidden_size": 64, "head_dim": 8}, "`hidden_size` 32"), ({"num_attention_heads": 2}, "`num_heads` 4"),
     ):  # fmt: skip
         with pytest.raises(InvalidInputError, match=words):
-            bridge.attach(model_of("llama", **{**SIZES, **TOKENS, **change}), EMBEDS)
+            bridge.attach(model_of("llama", **{**LLAMA, **TOKENS, **change}), EMBEDS)
     with pytest.raises(InvalidInputError, match="GPT2LMHeadModel, whose attention has no `o_proj`"):
         LanguageBridge.for_model(model_of("gpt2", n_layer=1, n_embd=32, n_head=4), D)
     with pytest.raises(NonFiniteError, match="float32 or bfloat16"):

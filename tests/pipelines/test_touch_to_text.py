@@ -9,8 +9,7 @@ from torch.testing import assert_close
 from transformers import TextIteratorStreamer
 
 from tests.helpers.calls import seeded
-from tests.helpers.components import D
-from tests.helpers.language import make_language_parts
+from tests.helpers.components import D, make_language_parts
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.pipelines import TouchToTextPipeline
