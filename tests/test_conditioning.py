@@ -48,7 +48,6 @@ def test_signal_and_noise_have_the_shares_of_the_schedule(level, signal, sigma):
     ("neighbours", "temperature", "share"), [(10, 0.05, 0.5), (5, 0.1, 0.0), (1, 0.1, 1.0), (50, 0.1, 0.5)]
 )
 def test_the_bridge_is_the_formula_of_the_papers_release(neighbours, temperature, share):
-    """Also with more neighbours than there are."""
     found = bridge_nearest(EMBEDS, BANK, neighbours=neighbours, temperature=temperature, share=share)
     for row, embed in zip(found, EMBEDS, strict=True):
         unit = embed / embed.norm()

@@ -37,13 +37,6 @@ def embeds(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> torch.T
         return model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels)))
 
 
-def named_as(found: list[Named], shares: np.ndarray) -> bool:
-    """Whether labels are named with these probabilities (N, labels), best first."""
-    rows = [dict(zip(NAMES, row.tolist(), strict=True)) for row in shares]
-    assert all(list(one.values()) == sorted(one.values(), reverse=True) for one in found)
-    return [pytest.approx(row, abs=1e-5) for row in rows] == found
-
-
 def test_embeddings_of_texts_are_at_unit_length(classifier):
     model, processor = classifier.model, classifier.processor
     classes = text_embeddings(model, processor, [f"this feels like {name}" for name in NAMES])
@@ -58,8 +51,10 @@ def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifie
     asked = [(template or PROMPTS["touch"]).format(name) for name in NAMES]
     classes = text_embeddings(classifier.model, classifier.processor, asked).double().numpy()
     cosines = embeds.double().numpy() @ classes.T / np.linalg.norm(embeds.double(), axis=1, keepdims=True)
-    shares = softmax(cosines / 0.07, axis=1)
-    assert named_as(classifier(images, NAMES, template), shares)
+    found = classifier(images, NAMES, template)
+    for named, shares in zip(found, softmax(cosines / 0.07, axis=1), strict=True):
+        assert named == pytest.approx(dict(zip(NAMES, shares.tolist(), strict=True)), abs=1e-5)
+        assert list(named.values()) == sorted(named.values(), reverse=True)
 
 
 def test_what_is_known_is_said_in_words():

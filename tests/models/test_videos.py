@@ -2,7 +2,6 @@
 
 import struct
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,14 +64,6 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     assert (processor.touch([file, recordings.frames()]) == expected).all()
 
 
-def shown_as(file: Path, *matrix: int) -> None:
-    """Writes the first two rows of the display matrix, (a, b, c, d), into the track header of an MP4 file."""
-    content = file.read_bytes()
-    at = content.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
-    a, b, c, d = (struct.pack(">i", value << 16) for value in matrix)
-    file.write_bytes(content[:at] + a + b + bytes(4) + c + d + content[at + 20 :])
-
-
 @pytest.mark.parametrize(
     ("matrix", "turned"),
     [
@@ -85,7 +76,9 @@ def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
     pytest.importorskip("av")
     file = recordings.write(tmp_path / "10:30 [a].mp4", list(recordings.frames()))
     stored = list(read_video("touch", file))
-    shown_as(file, *matrix)
+    content, (a, b, c, d) = file.read_bytes(), (struct.pack(">i", value << 16) for value in matrix)
+    at = content.index(b"tkhd") + 44  # the first two rows of the track's display matrix: ISO/IEC 14496-12, 8.3.2
+    file.write_bytes(content[:at] + a + b + bytes(4) + c + d + content[at + 20 :])
     for one, other in zip(read_video("touch", file), stored, strict=True):
         np.testing.assert_array_equal(one, turned(other))
     np.testing.assert_array_equal(Frame(str(file), index=9).read().permute(1, 2, 0), turned(stored[9]))
@@ -93,9 +86,8 @@ def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
 
 def test_pixels_of_a_video_are_made_square(tmp_path):
     file = recordings.write(tmp_path / "wide.mkv", list(recordings.frames()), pixel_aspect=2)
-    assert (
-        next(read_video("touch", file)).shape == Frame(str(file), index=0).read().permute(1, 2, 0).shape == (48, 128, 3)
-    )
+    assert next(read_video("touch", file)).shape == (48, 128, 3)
+    assert Frame(str(file), index=0).read().shape == (3, 48, 128)
 
 
 @pytest.mark.parametrize("kind", ["gif", "png", "webp", "tiff", "mp4"])

@@ -34,10 +34,6 @@ def draw(pipe, **options) -> torch.Tensor:
     return pipe(**{name: embeds}, generator=seeded(3), **given).images
 
 
-def same(one: torch.Tensor, other: torch.Tensor) -> None:
-    assert_close(one, other, atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("guidance_scale", [1.0, 7.5])
 @pytest.mark.parametrize("scheduler", SCHEDULERS)
 def test_same_picture_as_diffusers(pair, scheduler, guidance_scale):
@@ -48,9 +44,9 @@ def test_same_picture_as_diffusers(pair, scheduler, guidance_scale):
     theirs.scheduler.set_timesteps(5)
     noise = torch.randn(1, 4, 8, 8, generator=seeded(1))
     expected = draw(theirs, latents=noise * theirs.scheduler.init_noise_sigma, **options)
-    same(draw(ours, latents=noise, **options), expected)
+    assert_close(draw(ours, latents=noise, **options), expected, atol=1e-5, rtol=0)
     options["num_images_per_prompt"] = 2
-    same(draw(ours, **options), draw(theirs, **options))
+    assert_close(draw(ours, **options), draw(theirs, **options), atol=1e-5, rtol=0)
 
 
 FEATURES = {
@@ -69,7 +65,7 @@ FEATURES = {
 def test_a_feature_of_diffusers_draws_what_it_draws_there(pair, feature):
     theirs, ours = pair
     FEATURES[feature](theirs)  # on networks that both share
-    same(draw(ours), draw(theirs))
+    assert_close(draw(ours), draw(theirs), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("vae", ["kl", "tiny"])
@@ -90,7 +86,7 @@ def test_diffusers_makes_our_picture_of_an_image_of_our_parts(components, vae):
     back = quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
     assert back.processor.image_size == 32 and back.unet is ours.unet
     for pipe in (ours, back):
-        same(pipe(touch_embeds=embeds, generator=seeded(5), **options).images, expected)
+        assert_close(pipe(touch_embeds=embeds, generator=seeded(5), **options).images, expected, atol=1e-5, rtol=0)
     with pytest.raises(InvalidInputError, match="`unitouch`"):
         TouchToImagePipeline(**{**components, "unitouch": None}).to_diffusers()
 

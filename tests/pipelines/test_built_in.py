@@ -41,7 +41,6 @@ def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_
 
 
 def test_a_tolerance_is_kept(call):
-    """Against many more steps of another solver."""
     found, reference = call(tolerance=0.1, output_type="latent"), call.latents(solver="dpm++2m", num_inference_steps=30)
     assert (found.images - reference).norm() / reference.norm() < 0.12
     assert found.report.evaluations < 40 and found.report.solver == "adaptive"

@@ -58,7 +58,6 @@ def test_it_may_interrupt_its_own_call(call):
 
 
 def test_hidden_states_that_it_returns_count_from_then_on(call):
-    """Whether it asked for those before or not."""
     name, options = call.pipe._callback_tensor_inputs[1], {"num_inference_steps": 3}
     other = torch.randn(4, 1 if name == "condition_embeds" else 12, 16, generator=seeded())
     change = {"callback_on_step_end": lambda *_: {name: other}}

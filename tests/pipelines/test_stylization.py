@@ -61,7 +61,6 @@ def test_touch_alone_is_touch_to_image(stylize, components, photo, touch):
 
 
 def test_a_photo_alone_is_diffusers_image_variation(stylize, components, photo, touch, embeds):
-    """`StableUnCLIPImg2ImgPipeline` on the photo's embedding at the norm of images."""
     options = {"image_embeds": embeds["image"][:1], "prompt": "high quality", "height": 16, "width": 16}
     expected = pictures(diffusers_pipeline(components), **options, num_inference_steps=2, guidance_scale=2.0)
     ran = watched(stylize)

@@ -45,7 +45,6 @@ def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch):
     [(None, ["gelsight", "digit"]), ("digit", ["digit"] * 2), ([None, "gelsight"], ["gelsight"] * 2)],
 )
 def test_sensors_are_those_named_or_retrieved_by_their_prototypes(pipe, touch, sensor, expected):
-    """One touch is dark as the prototype of GelSight, the other bright as that of DIGIT."""
     report = pipe(touch, sensor=sensor).report
     assert report.sensors == expected
     if sensor is None:

@@ -58,10 +58,6 @@ def make(output: Path, *, options: dict[str, Any] | None = None, **changes: Any)
     return Trainer(objective, data(), indices_of, config, output), objective
 
 
-def equal(first: list[Tensor], second: list[Tensor]) -> bool:
-    return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-
-
 def test_training_reaches_the_closed_form_of_least_squares(tmp_path: Path) -> None:
     changes = {"steps": 250, "batch_size": ROWS, "learning_rate": 0.1, "weight_decay": 0.0, "save_every": 1000}
     trainer, objective = make(tmp_path, **changes)
@@ -133,7 +129,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, e
         else:
             trainer.resume()
             trainer.fit()  # the second time there is nothing left to do
-            assert equal(objective.weights(), expected.weights())
+            assert all(map(torch.equal, objective.weights(), expected.weights()))
         assert checkpoints_in(tmp_path / "killed")[-1].name == f"step-{steps:08d}"
 
 

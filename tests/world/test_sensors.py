@@ -54,12 +54,6 @@ def touch(height: torch.Tensor, depth: float, sensor: Sensor, dwell: float = 0.5
     return touch_images(height, depth * full, dwell * full, sensor, size)
 
 
-def ball(radius: float, size: int = 128) -> torch.Tensor:
-    axis = pixel_axis(size)
-    off = axis[None, :] ** 2 + axis[:, None] ** 2
-    return torch.where(off < radius**2, (radius**2 - off).clamp_min(0.0).sqrt(), torch.tensor(-4.0))[None]
-
-
 @pytest.mark.parametrize("sensor", SOME)
 def test_a_gel_is_untouched_before_contact_before_time_and_where_nothing_is_near(sensor: Sensor) -> None:
     untouched, rough = untouched_gel(sensor, 64), torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
@@ -78,7 +72,9 @@ def test_a_flat_full_contact_shows_no_slopes_and_a_dome_is_touched_in_its_middle
 
 
 def test_markers_only_darken_and_move_alike_on_both_sides_of_a_ball() -> None:
-    bare, dots = (touch(ball(30.0), 1.0, sensor, size=66) for sensor in (PLAIN, MARKED))
+    axis = pixel_axis(128)
+    ball = (30.0**2 - axis[None, :] ** 2 - axis[:, None] ** 2).sqrt()[None]
+    bare, dots = (touch(ball, 1.0, sensor, size=66) for sensor in (PLAIN, MARKED))
     assert (dots <= bare + 1e-6).all() and (dots < bare - 0.05).any()
     shade = dots / bare  # the lights are not alike on both sides, but what the markers take is
     torch.testing.assert_close(shade, shade.flip(-1), rtol=0, atol=2e-3)
