@@ -68,23 +68,17 @@ def object_probes(features: np.ndarray, truth: Mapping[str, np.ndarray], objects
     predicted = {name: cross_val_predict(probe, features, labels, **cut) for name, labels in truth.items()}
 
     def shares(rows: np.ndarray) -> dict[str, float]:
+        pairs = {name: (labels[rows], predicted[name][rows]) for name, labels in truth.items()}
         return {
-            name: float(
-                recall_score(labels[rows], predicted[name][rows], labels=np.unique(labels[rows]), average="macro")
-            )
-            for name, labels in truth.items()
+            name: float(recall_score(true, found, labels=np.unique(true), average="macro"))
+            for name, (true, found) in pairs.items()
         }
 
-    found = shares(np.arange(len(objects)))
-    means = [np.mean(list(shares(rows).values())) for rows in _draws(objects)]
+    found, rng, names = shares(np.arange(len(objects))), np.random.default_rng(0), np.unique(objects)
+    rows_of = {name: np.flatnonzero(objects == name) for name in names}
+    draws = [np.concatenate([rows_of[name] for name in rng.choice(names, len(names))]) for _ in range(200)]
+    means = [np.mean(list(shares(rows).values())) for rows in draws]
     return {**found, "mean": float(np.mean(list(found.values()))), "deviation": float(np.std(means))}
-
-
-def _draws(groups: np.ndarray) -> list[np.ndarray]:
-    """Rows of 200 draws of groups, with replacement."""
-    rng, names = np.random.default_rng(0), np.unique(groups)
-    rows_of = {name: np.flatnonzero(groups == name) for name in names}
-    return [np.concatenate([rows_of[name] for name in rng.choice(names, len(names))]) for _ in range(200)]
 
 
 def _picture(box: ZipFile, name: str) -> np.ndarray:

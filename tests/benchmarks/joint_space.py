@@ -1,7 +1,6 @@
 """What a joint space knows of contacts that nobody trained on.
 
-Objects are held out: of the split "test" in the ranges of those to train on, of "beyond"
-outside of them.
+Objects are held out: of the split "test" in the ranges of those to train on, of "beyond" outside of them.
 """
 
 from collections.abc import Sequence
@@ -26,12 +25,7 @@ from unitouch_gen.world import MATERIAL_NAMES
 
 
 def held_out(
-    cache: Path,
-    processor: UniTouchProcessor,
-    seed: int,
-    split: str,
-    sensor: str | None = None,
-    objects: int = 16,
+    cache: Path, processor: UniTouchProcessor, seed: int, split: str, sensor: str | None = None, objects: int = 16
 ) -> Contacts:
     """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
     source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, objects)

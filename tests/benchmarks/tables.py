@@ -80,15 +80,12 @@ SUMMARY = {
 }
 """What README.md shows, in its words."""
 
-ELSEWHERE = ("touch: material", "touch to picture: material", "photo to touch: material")
-"""What it shows of drawn sensors and beyond the ranges of training."""
-
 
 def elsewhere(quality: Figures) -> list[str]:
     """A line each on sensors drawn anew, and on what lies beyond the ranges of training."""
-    lines = []
+    lines, names = [], ("touch: material", "touch to picture: material", "photo to touch: material")
     for part, words in {"drawn": "By sensors drawn anew", "beyond": "Beyond the ranges of training"}.items():
-        found = [(name, quality[part][name]) for name in ELSEWHERE if name in quality[part]]
+        found = [(name, quality[part][name]) for name in names if name in quality[part]]
         told = [
             f"{SUMMARY[name].replace('*', '')} {_shown(name, row['value'])} (shuffled {_shown(name, row['shuffled'])})"
             for name, row in found
@@ -162,22 +159,15 @@ def real_table(figures: Figures) -> str:
 # Error and time -------------------------------------------------------------------------------------------------------
 
 
-def _amount(run: Mapping[str, Any] | None) -> str:
-    """ "`unipc`, 20 steps"."""
-    return "-" if run is None else f"`{run['solver']}`, {run['steps']} steps"
-
-
 def cost_table(figures: Figures) -> str:
     """How many steps for what error, at the built-in pipelines' own guidance."""
     pipelines = {name: figures["error_and_time"]["cost"][name] for name in MADE}
     errors = dict.fromkeys(error for each in pipelines.values() for error in each["cost_at_error"])
-    rows = [
-        [
-            f"at most {percent(float(error))}",
-            *(_amount(each["cost_at_error"].get(error)) for each in pipelines.values()),
-        ]
-        for error in errors
-    ]
+    rows = []
+    for error in errors:
+        runs = [each["cost_at_error"].get(error) for each in pipelines.values()]
+        told = ["-" if run is None else f"`{run['solver']}`, {run['steps']} steps" for run in runs]
+        rows.append([f"at most {percent(float(error))}", *told])
     heads = [f"{MADE[name]}, guidance {each['guidance_scale']:g}" for name, each in pipelines.items()]
     counts = sorted({each["conditions"] for each in pipelines.values()})
     note = (
@@ -187,16 +177,11 @@ def cost_table(figures: Figures) -> str:
     return table(["error", *heads], rows, note)
 
 
-DISTILLED = ("touch to picture", "photo to touch")
-"""What is drawn in four evaluations, too."""
-
-ENDS = ("material", "grain within 20", "contact within material", "Frechet distance")
-
-
 def turbo_table(figures: Figures) -> str:
     """What is drawn by default and in four evaluations, and how much faster that is than DDIM in 50 steps."""
     quality, rows = figures["quality"]["rows"], []
-    for name in (f"{made}: {end}" for made in DISTILLED for end in ENDS):
+    ends = ("material", "grain within 20", "contact within material", "Frechet distance")
+    for name in (f"{made}: {end}" for made in ("touch to picture", "photo to touch") for end in ends):
         both = [quality[name], quality[f"in four evaluations, {name}"]]
         values = (f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})" for row in both)
         rows.append([name, *values, *(_shown(name, both[1][key]) for key in CONTROLS)])
