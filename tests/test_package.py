@@ -59,17 +59,13 @@ def test_nothing_is_relative_in_what_an_index_shows():
     assert targets(text) and all(re.match("https?://", target) for target in targets(text))
 
 
-def described(text: str, url: str) -> str:
-    """What setup.py makes of a README."""
-    return runpy.run_path(str(CHECKOUT / "setup.py"))["described"](text, url)
-
-
 without_setup = pytest.mark.skipif(not (CHECKOUT / "setup.py").is_file(), reason="there is no checkout here")
 
 
 @without_setup
 def test_the_readme_becomes_one_without_files_beside_it():
     """All that it links to, at the repository's address, or what has an address anyway."""
+    described = runpy.run_path(str(CHECKOUT / "setup.py"))["described"]
     text, url = (CHECKOUT / "README.md").read_text(), "https://host.example/owner/unitouch_gen"
     absolute = [target for target in targets(text) if re.match("https?://", target)]
     expected = [
@@ -121,9 +117,7 @@ def test_a_clone_imports_as_it_lies():
 
 
 def test_the_command_line_answers(tmp_path):
-    script = Path(sys.executable).with_name("unitouch-gen")
-    done = subprocess.run([script, "--help"], cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
-    assert "touch-to-image" in done.stdout
+    assert "touch-to-image" in run([str(Path(sys.executable).with_name("unitouch-gen")), "--help"], tmp_path)
 
 
 def test_training_runs_as_a_module(tmp_path):

@@ -19,22 +19,15 @@ pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checko
 
 NOT_RUN = {"drawing": "draws for the others", "render_inputs": "writes into the checkout", "watch": "needs a camera"}
 
-RED = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1)
-
-
-def red(grid: Image.Image) -> np.ndarray:
-    """Where a grid is purely red (H, W)."""
-    return (np.asarray(grid) == (255, 0, 0)).all(axis=2)
-
 
 @pytest.mark.parametrize("blocks", [1, 2, 3])
 def test_no_word_covers_a_tile(blocks):
     labels = ["synthetic fabric", "woven natural fabric", "", "gjpqy", "glass"]
     titles = ["touch", "true picture", "an unusually long title of a column"]
-    rows = [[RED.expand(3, 4, 4)] * 3] * 5
+    rows = [[torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1).expand(3, 4, 4)] * 3] * 5  # red
     for side, size in ((64, 12), (128, 20), (192, 24)):
         grid = draw_grid(rows, labels=labels, titles=titles, side=side, size=size, blocks=blocks)
-        assert red(grid).sum() == 15 * side**2
+        assert (np.asarray(grid) == (255, 0, 0)).all(axis=2).sum() == 15 * side**2
 
 
 def test_a_tile_keeps_its_pixels():

@@ -47,9 +47,8 @@ class Knowing:
     def __call__(self, touch_embeds, question, **options):
         known = [self.asked[int(row)] for row in touch_embeds.argmax(dim=1)]
         rows = zip(known, question, strict=True)
-        return SimpleNamespace(
-            texts=[next(true[0] for asked, true in one.values() if asked == text) for one, text in rows]
-        )
+        texts = [next(true[0] for asked, true in one.values() if asked == text) for one, text in rows]
+        return SimpleNamespace(texts=texts)
 
 
 def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):

@@ -29,14 +29,6 @@ def images() -> torch.Tensor:
     return torch.rand(3, 3, 32, 32, generator=torch.Generator().manual_seed(1))
 
 
-@pytest.fixture
-def embeds(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> torch.Tensor:
-    """Embeddings of the touches."""
-    model, pixels = classifier.model, classifier.processor.touch(images)
-    with torch.no_grad():
-        return model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels)))
-
-
 def test_embeddings_of_texts_are_at_unit_length(classifier):
     model, processor = classifier.model, classifier.processor
     classes = text_embeddings(model, processor, [f"this feels like {name}" for name in NAMES])
@@ -47,10 +39,13 @@ def test_embeddings_of_texts_are_at_unit_length(classifier):
 
 
 @pytest.mark.parametrize("template", [None, "looks {}"])
-def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifier, images, embeds):
+def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifier, images):
     asked = [(template or PROMPTS["touch"]).format(name) for name in NAMES]
     classes = text_embeddings(classifier.model, classifier.processor, asked).double().numpy()
-    cosines = embeds.double().numpy() @ classes.T / np.linalg.norm(embeds.double(), axis=1, keepdims=True)
+    model, pixels = classifier.model, classifier.processor.touch(images)
+    with torch.no_grad():
+        embeds = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).double().numpy()
+    cosines = embeds @ classes.T / np.linalg.norm(embeds, axis=1, keepdims=True)
     found = classifier(images, NAMES, template)
     for named, shares in zip(found, softmax(cosines / 0.07, axis=1), strict=True):
         assert named == pytest.approx(dict(zip(NAMES, shares.tolist(), strict=True)), abs=1e-5)

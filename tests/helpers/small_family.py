@@ -24,9 +24,8 @@ def write_small_family(folder: Path) -> None:
         config[name] |= {"hidden_size": width, "num_hidden_layers": 1, "projection_dim": width}
     for name in ("vision_config", "text_config"):
         config[name] |= {"intermediate_size": width}
-    UniTouchModel(UniTouchConfig(**{**config, "projection_dim": width, "ood_thresholds": {}})).half().save_pretrained(
-        joint
-    )
+    config = UniTouchConfig(**{**config, "projection_dim": width, "ood_thresholds": {}})
+    UniTouchModel(config).half().save_pretrained(joint)
 
     for part, own in (
         (weights.X_TO_TOUCH, {}),

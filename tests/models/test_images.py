@@ -166,9 +166,8 @@ def test_a_tiff_of_planes_and_one_whose_zero_is_white(processor: UniTouchProcess
         table = struct.pack("<H", 2 + len(own)) + entries + bytes(4)
         head = struct.pack("<2sHI", b"II", 42, at + len(lists))
         (tmp_path / name).write_bytes(head + values.tobytes() + lists + table)
-        torch.testing.assert_close(
-            processor.raw_images(tmp_path / name), pixels_of(expected / 65535), rtol=0, atol=1e-5
-        )
+        found = processor.raw_images(tmp_path / name)
+        torch.testing.assert_close(found, pixels_of(expected / 65535), rtol=0, atol=1e-5)
 
 
 def test_a_photo_that_moves_is_its_first_frame_and_told(processor: UniTouchProcessor, tmp_path: Path) -> None:

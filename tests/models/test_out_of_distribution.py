@@ -48,9 +48,8 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     noise = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     mixed = torch.stack([noise[:, 0], 0.5 * noise[:, 0] + 0.5 * noise[:, 1], noise[:, 2]], dim=1)
     grey = noise[:, :1].expand(-1, 3, -1, -1)
-    statistics = touch_statistics(
-        torch.ones(3, 2, 4, 4), normalise_pixels(torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
-    )
+    pixels = normalise_pixels(torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
+    statistics = touch_statistics(torch.ones(3, 2, 4, 4), pixels)
     assert (statistics[:, :2] == 1.0).all() and bool(torch.isfinite(statistics).all())
     statistics = statistics[:, 2:]
     expected = np.corrcoef(mixed.flatten(2)[0].numpy())[[0, 0, 1], [1, 2, 2]]

@@ -41,10 +41,8 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
         attention.load_state_dict({theirs: weights[f"blocks.{i}.attention.{ours}"] for theirs, ours in names.items()})
         normed = norm(x, f"blocks.{i}.norm_1")
         x = x + attention(normed, normed, normed, need_weights=False)[0]
-        hidden = F.linear(
-            norm(x, f"blocks.{i}.norm_2"), weights[f"blocks.{i}.mlp.0.weight"], weights[f"blocks.{i}.mlp.0.bias"]
-        )
-        x = x + F.linear(F.gelu(hidden), weights[f"blocks.{i}.mlp.2.weight"], weights[f"blocks.{i}.mlp.2.bias"])
+        one, other = ([weights[f"blocks.{i}.mlp.{layer}.{part}"] for part in ("weight", "bias")] for layer in (0, 2))
+        x = x + F.linear(F.gelu(F.linear(norm(x, f"blocks.{i}.norm_2"), *one)), *other)
     embeds = norm(x, "norm")[:, 0] @ weights["projection.weight"].T
     if config.patch_channels:
         last = norm(x[:, -len(vit.position[0]) + 1 :], "patch_projection.norm")

@@ -12,17 +12,10 @@ from matplotlib.text import Text
 from PIL import Image
 
 from tests.helpers.components import make_pipelines
+from unitouch_gen.numerics import work_precision
 from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.numerics.work_precision import (
-    draw_chart,
-    measure,
-    pareto_front,
-    pipeline_target,
-    problem_target,
-    save,
-    world_inputs,
-)
+from unitouch_gen.numerics.work_precision import measure, pareto_front, pipeline_target, problem_target
 from unitouch_gen.sampling import Guidance
 
 GAUSSIAN = problem_target(PROBLEMS["gaussian"], 3)
@@ -54,7 +47,7 @@ def test_what_cannot_be_run_or_breaks_is_a_row_as_well():
 @pytest.mark.parametrize(("name", "scale"), [("touch-to-image", 2.0), ("stylize", 2.0), ("x-to-touch", 1.0)])
 def test_the_flow_of_a_pipeline_is_the_one_that_its_call_follows(name, scale):
     """The same latents from the same noise; solvers come to the reference."""
-    pipe, inputs = PIPES[name], world_inputs(MODALITIES[name], 1)
+    pipe, inputs = PIPES[name], work_precision.world_inputs(MODALITIES[name], 1)
     # Of few levels: a network of random weights changes with every one of them.
     pipe.scheduler = DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2)
     pipe.set_progress_bar_config(disable=True)
@@ -109,10 +102,10 @@ def test_files_are_rows_and_a_chart_of_them(tmp_path):
     rows += [row(3, 0.3, "default", default=True), {**row(5, solver="unipc"), "failures": 8, "reason": "diverged"}]
     failed = {key: value for key, value in rows[-1].items() if key not in ("error", "seconds", "evaluations")}
     target = replace(GAUSSIAN, own_error=3e-5)
-    results, png = save(tmp_path, target, [*rows, failed])
+    results, png = work_precision.save(tmp_path, target, [*rows, failed])
     assert json.loads(results.read_text())["rows"][0] == rows[0]
     with Image.open(png) as picture:
         assert len(picture.convert("RGB").getcolors(2**24)) > 50
-    words = {text.get_text() for text in draw_chart(target, rows).findobj(Text)}
+    words = {text.get_text() for text in work_precision.draw_chart(target, rows).findobj(Text)}
     assert {"heun", "reference's own error 3e-05"} <= words
-    save(tmp_path, GAUSSIAN, [failed])  # nothing but failures is a chart as well
+    work_precision.save(tmp_path, GAUSSIAN, [failed])  # nothing but failures is a chart as well

@@ -83,7 +83,6 @@ def test_an_upload_holds_the_card_and_all_that_loaders_need(pipe, tmp_path, monk
     monkeypatch.setattr("unitouch_gen.pipelines.base.create_repo", lambda *_, **__: repository)
     monkeypatch.setattr(TouchToImagePipeline, "_upload_folder", upload)
     pipe.save_pretrained(tmp_path / "saved", push_to_hub=True, repo_id=REPOSITORY, variant="fp16")
-    assert {"model_index.json", "pipeline.py", "unitouch/pipeline.py", "unitouch/model.fp16.safetensors"} <= set(
-        uploaded
-    )
+    needed = {"model_index.json", "pipeline.py", "unitouch/pipeline.py", "unitouch/model.fp16.safetensors"}
+    assert needed <= set(uploaded)
     assert f'TouchToImagePipeline.from_pretrained("{REPOSITORY}")' in uploaded["README.md"]

@@ -108,9 +108,8 @@ def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Pa
     objective.trained = model  # with tokens of sensors and of the class, tables, norms, and a learned key and value
     trainer = Trainer(objective, data(), lambda step: [0], CONFIG, tmp_path)
     names = {id(parameter): name for name, parameter in model.named_parameters()}
-    decayed = {
-        names[id(p)] for group in trainer.optimizer.param_groups for p in group["params"] if group["weight_decay"]
-    }
+    groups = [group["params"] for group in trainer.optimizer.param_groups if group["weight_decay"]]
+    decayed = {names[id(parameter)] for group in groups for parameter in group}
     kinds = {name: type(model.get_submodule(name.rpartition(".")[0])).__name__ for name in names.values()}
     assert decayed == {name for name in kinds if kinds[name] in ("Linear", "Conv2d") and name.endswith(".weight")}
     assert {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in {*kinds} - decayed}

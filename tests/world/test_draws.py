@@ -30,9 +30,8 @@ def test_held_out_objects_are_in_the_ranges_and_those_beyond_outside_of_them(num
     )
     low, high = trained.aminmax()
     assert not torch.isin(held_out, trained).any()
-    torch.testing.assert_close(
-        torch.stack(held_out.aminmax()), torch.stack((low, high)), rtol=0, atol=(high - low) / 99
-    )
+    near = {"rtol": 0, "atol": (high - low) / 99}
+    torch.testing.assert_close(torch.stack(held_out.aminmax()), torch.stack((low, high)), **near)
     assert not ((beyond > low) & (beyond < high)).any()
 
 

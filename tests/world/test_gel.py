@@ -43,9 +43,8 @@ def test_a_gel_that_follows_is_drawn_along_exponentially_beside_a_ridge(correlat
     """u - c^2 u'' = 0 beside a ridge of one depth, and the ridge's own depth where it touches."""
     x = pixel_axis(192, EXTENT).double()
     load = 0.5 * (x.abs() < 2.0).double().expand(1, 192, -1)
-    u, few = (
-        displaced(load, math.inf, replace(GEL, correlation=correlation, contact_steps=steps)) for steps in (200, 20)
-    )
+    gels = (replace(GEL, correlation=correlation, contact_steps=steps) for steps in (200, 20))
+    u, few = (displaced(load, math.inf, gel) for gel in gels)
     edge = x[x.abs() < 2.0].max()
     beside = 0.5 * torch.exp(-(x.abs() - edge).clamp_min(0.0) / correlation)
     torch.testing.assert_close(u[0, 0], beside, rtol=0.0, atol=0.03)

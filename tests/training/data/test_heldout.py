@@ -22,9 +22,8 @@ def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cac
     monkeypatch.setattr(heldout, "CONTACTS", 1)
     for number, sensor in enumerate(model.config.sensors):
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3 + 0.2 * number))
-    (name, known, seed, splits), (other, strange, *_) = of_world(
-        cache, model, processor, ["digit"], [1], 1, grasps=True
-    )
+    found = of_world(cache, model, processor, ["digit"], [1], 1, grasps=True)
+    (name, known, seed, splits), (other, strange, *_) = found
     assert (name, known, seed, tuple(splits)) == ("digit", True, 1001, SPLITS)
     assert other == "sensors drawn anew" and not strange
     objects = [set(contacts.objects.tolist()) for contacts in splits.values()]

@@ -17,10 +17,12 @@ from unitouch_gen.training.data.records import Frame
 ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
 
 
-def write(folder: Path, files: dict[str, int | str]) -> None:
-    """Images of the colours of numbers, and texts."""
+def write(folder: Path, files: dict) -> None:
+    """Images of the colours of numbers, and texts; a folder of no content is removed."""
     for name, content in files.items():
-        if isinstance(content, int):
+        if content is None:
+            shutil.rmtree(folder / name)
+        elif isinstance(content, int):
             write_image(folder / name, shade(content))
         else:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -37,17 +39,13 @@ def number_of(frame: Frame | None) -> int | None:
 
 def told(data: RecordSet) -> list[str]:
     """Of each record: id, numbers of touch, picture and background, sensor, object, recording, split, and classes."""
-    return [
-        " ".join(
-            "-" if word is None else str(word)
-            for word in (
-                *(record.id, number_of(record.touch), number_of(record.picture), number_of(record.background)),
-                *(record.sensor, record.object, record.recording, record.split),
-                *(f"{label}={data.classes[label][number]}" for label, number in record.labels.items()),
-            )
-        )
-        for record in data.records
-    ]
+    lines = []
+    for record in data.records:
+        numbers = [number_of(frame) for frame in (record.touch, record.picture, record.background)]
+        labels = [f"{label}={data.classes[label][number]}" for label, number in record.labels.items()]
+        words = [record.id, *numbers, record.sensor, record.object, record.recording, record.split, *labels]
+        lines.append(" ".join("-" if word is None else str(word) for word in words))
+    return lines
 
 
 def touch_and_go(folder: Path) -> None:
@@ -241,12 +239,8 @@ def test_touch_and_picture_of_videos_are_paired_by_time_or_number(timed: bool, t
     assert pairs == ({0: 0, 3: 0, 7: 2, 11: 4} if timed else {number: number for number in (0, 3, 7, 11)})
 
 
-def gone(*names: str) -> Callable[[Path], None]:
-    return lambda folder: [shutil.rmtree(folder / name) for name in names] and None
-
-
 BROKEN = [
-    (touch_and_go, gone(f"dataset/{ONE}/gelsight_frame"), r"2 of 6 files are not there: .*gelsight\.mp4; .*video\.mp4"),
+    (touch_and_go, {f"dataset/{ONE}/gelsight_frame": None}, r"2 of 6 files are not there:.*gelsight\.mp4;.*video\.mp4"),
     (touch_and_go, {"test.txt": f"{ONE}/0000000000.jpg,3\n"}, r"train.txt and test.txt both list .*00\.jpg"),
     (touch_and_go, {"label.txt": f"{ONE}/0.jpg;3\n"}, r"label\.txt' has '.*;3'; a line is recording/frame"),
     (feeling_of_success, {"calandra_corl2017_001.h5": "gone"}, r"_001\.h5' is no list of attempts"),
@@ -263,10 +257,7 @@ BROKEN = [
 @pytest.mark.parametrize(("make", "damage", "message"), BROKEN)
 def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_path: Path) -> None:
     make(tmp_path)
-    if callable(damage):
-        damage(tmp_path)
-    else:
-        write(tmp_path, damage)
+    write(tmp_path, damage)
     with pytest.raises(InvalidInputError, match=f"`path` is .*, read as .*{message}"):
         open_dataset(tmp_path)
 
