@@ -41,8 +41,9 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
         attention.load_state_dict({theirs: weights[f"blocks.{i}.attention.{ours}"] for theirs, ours in names.items()})
         normed = norm(x, f"blocks.{i}.norm_1")
         x = x + attention(normed, normed, normed, need_weights=False)[0]
-        one, other = ([weights[f"blocks.{i}.mlp.{layer}.{part}"] for part in ("weight", "bias")] for layer in (0, 2))
-        x = x + F.linear(F.gelu(F.linear(norm(x, f"blocks.{i}.norm_2"), *one)), *other)
+        up, down = ([weights[f"blocks.{i}.mlp.{layer}.{part}"] for part in ("weight", "bias")] for layer in (0, 2))
+        hidden = F.gelu(F.linear(norm(x, f"blocks.{i}.norm_2"), *up))
+        x = x + F.linear(hidden, *down)
     embeds = norm(x, "norm")[:, 0] @ weights["projection.weight"].T
     if config.patch_channels:
         last = norm(x[:, -len(vit.position[0]) + 1 :], "patch_projection.norm")

@@ -188,7 +188,6 @@ for each in (*solver_cases(), *network_cases(), *cases(tiny, KINDS)):
     GROUPS.setdefault((re.split("[,:]", each.name)[0], slow), []).append(each)
 
 
-@pytest.mark.filterwarnings("ignore")  # libraries warn of extreme input
 @pytest.mark.parametrize(
     "group", [pytest.param(key, id=key[0], marks=pytest.mark.slow if key[1] else ()) for key in GROUPS]
 )
