@@ -78,6 +78,16 @@ def test_answers_name_what_was_touched_or_seen():
     assert pipe(image=unitouch_gen.example("wood", "image"), question="What is it?").texts == ["it is wood."]
 
 
+def test_diffusers_own_pipeline_makes_the_same_picture():
+    pipe = quiet(unitouch_gen.tiny("touch-to-image"))
+    embeds = pipe.encode_touch(unitouch_gen.example("brick"))
+    options = {"prompt": "metal", "num_inference_steps": 3, "guidance_scale": 3.0}
+    options |= {"noise_level": 250, "output_type": "pt"}
+    found = pipe(touch_embeds=embeds, generator=seeded(), **options).images
+    expected = quiet(pipe.to_diffusers())(image_embeds=embeds, generator=seeded(), **options).images
+    assert_close(found, expected, atol=1e-5, rtol=0)
+
+
 # In four evaluations: LoRA weights under diffusers' `LCMScheduler` ---------------------------------------------------
 
 
