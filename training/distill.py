@@ -27,7 +27,7 @@ from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts
-from unitouch_gen.training.losses import SnrGamma, denoising_losses, predict
+from unitouch_gen.training.losses import denoising_loss, predict
 from unitouch_gen.training.recipe import Arguments, Settings, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage, run
 
@@ -43,7 +43,6 @@ class DistillSettings(Settings):
     steps: Annotated[int, Field(ge=1, le=50)]  # of `LCMScheduler`, in which the student draws
     margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
     critic_rank: PositiveInt  # of the critic's LoRA layers, which are not kept
-    snr_gamma: SnrGamma  # of its losses
 
 
 class DistillRecipe(Recipe):
@@ -77,9 +76,9 @@ class DistillObjective(nn.Module):
         drawn = self.drawn(torch.randn(shape, device=device), conditions)
         aim = self.moved(drawn.detach(), conditions, unconditional)
         self._take(CRITIC)
-        critic = denoising_losses(self.trained, self.scheduler, drawn.detach(), self.settings.snr_gamma, **conditions)
+        critic = denoising_loss(self.trained, self.scheduler, drawn.detach(), step_power=1.0, **conditions)
         student = 0.5 * (drawn - aim).square().mean()
-        return {"loss": student + critic["loss"], "student": student.detach(), "critic": critic["mse"]}
+        return {"loss": student + critic, "student": student.detach(), "critic": critic.detach()}
 
     def drawn(self, z: Tensor, conditions: dict[str, Tensor]) -> Tensor:
         """Latents (B, C, h, w) that the student predicts in one of its steps, from noise (B, C, h, w)."""

@@ -30,7 +30,7 @@ from unitouch_gen.training.data import DrawnContacts, Rendered, sensor_numbers
 from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents
-from unitouch_gen.training.losses import SnrGamma, denoising_losses
+from unitouch_gen.training.losses import StepPower, denoising_loss
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 
@@ -41,7 +41,7 @@ class TouchDiffusionSettings(Settings):
     condition_dropout: Share  # probability of training a sample without condition, for guidance; its token is zeros
     noisy_share: Share  # of perturbed conditions, since those of other modalities lie beside the images' own
     condition_noise: NonNegativeFloat  # largest norm of that perturbation, relative to the embedding's
-    snr_gamma: SnrGamma
+    step_power: StepPower
 
 
 class BankSettings(Settings):
@@ -75,7 +75,7 @@ class TouchDiffusionObjective(nn.Module):
         latents, settings = batch["latents"].float(), self.settings
         kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
         conditions = self.conditions(batch, kept)
-        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
+        return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
         """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""

@@ -19,7 +19,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.image_vae import cached_latents
-from unitouch_gen.training.losses import SnrGamma, denoising_losses
+from unitouch_gen.training.losses import StepPower, denoising_loss
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 
@@ -32,7 +32,7 @@ class UnclipSettings(Settings):
     empty_share: Share
     clean_share: Share  # of the embeddings at noise level 0; the levels of the others are uniform
     gain: Share  # lowest on the embedding; uniform up to 1, so that a strength below 1 is known in training
-    snr_gamma: SnrGamma
+    step_power: StepPower
 
     @model_validator(mode="after")
     def _prompts_are_at_most_all(self) -> Self:
@@ -68,7 +68,7 @@ class UnclipObjective(nn.Module):
         latents, settings = batch["latents"].float(), self.settings
         kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
         conditions = self.conditions(batch, kept)
-        return denoising_losses(self.trained, self.scheduler, latents, settings.snr_gamma, **conditions)
+        return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
         """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""

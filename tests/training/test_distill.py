@@ -26,7 +26,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(steps=4, margin=0.02, critic_rank=2, snr_gamma=5.0)
+SETTINGS = DistillSettings(steps=4, margin=0.02, critic_rank=2)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 

@@ -28,9 +28,9 @@ from unitouch_gen.world import ATTRIBUTES, untouched_gel
 COUNT, NORM = 600, 14.0
 SCHEDULER = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
 UNCLIP = unclip.UnclipSettings(
-    condition_dropout=0.25, caption_share=0.2, empty_share=0.15, clean_share=0.4, gain=0.7, snr_gamma=5.0
+    condition_dropout=0.25, caption_share=0.2, empty_share=0.15, clean_share=0.4, gain=0.7, step_power=2.0
 )
-DIFFUSION = touch_ldm.TouchDiffusionSettings(condition_dropout=0.0, noisy_share=0.0, condition_noise=0.0, snr_gamma=5.0)
+DIFFUSION = touch_ldm.TouchDiffusionSettings(condition_dropout=0, noisy_share=0, condition_noise=0, step_power=2.0)
 PLAIN = AutoencoderLoss(gradient_weight=0.0, latent_noise=0.0, latent_weight=0.0)
 STILL = TouchAugmentation(permute=0.0, blur=0.0)
 PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.uint8)
