@@ -9,6 +9,7 @@ The result is a LoRA file. Pipelines use it with that scheduler and a `guidance_
 """
 
 import warnings
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -131,12 +132,21 @@ def train_layers(unet: UNet2DConditionModel) -> None:
             parameter.requires_grad_(True)
 
 
-def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int) -> None:
-    """Adds the LoRA layers of student and critic to a network; only these are trained."""
+def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, init: Path | None = None) -> None:
+    """Adds the LoRA layers of student and critic to a network; only these are trained.
+
+    The student's begin as those stored in the folder `init`, if there is one.
+    """
     ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's own
     kind = needed("peft").LoraConfig
     configs = {name: build("lora", kind, {**lora, "r": rank}, lora_alpha=rank) for name, rank in ranks.items()}
     unet.requires_grad_(False)
+    if init is not None:
+        with reading("init", init):
+            unet.load_lora_adapter(init, prefix="unet", adapter_name=STUDENT, use_safetensors=True)
+        if not getattr(unet, "peft_config", None):
+            raise InvalidInputError(f"`init` is {str(init)!r}, which holds no LoRA weights of a UNet.")
+        del configs[STUDENT]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
         try:
@@ -195,7 +205,7 @@ def main(stage: Stage) -> None:
     with reading("model", folder):
         unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
-    add_layers(unet, recipe.lora, recipe.objective.critic_rank)
+    add_layers(unet, recipe.lora, recipe.objective.critic_rank, stage.folders.get("init"))
     conditioned, dataset = conditioned_by(stage, settings, unet, scheduler)
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)

@@ -67,6 +67,7 @@ def distill(
     overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
     cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
+    init: Annotated[Path | None, Option(exists=True, help="Folder of LoRA weights to start from.")] = None,
 ) -> None:
     """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (DMD2, LoRA).
 
@@ -76,6 +77,6 @@ def distill(
     from unitouch_gen.training.distill import DistillRecipe, main
     from unitouch_gen.training.stages import run_stage
 
-    given = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume}
+    given = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume, "init": init}
     run_stage("distill", DistillRecipe, main, model=folder, output=output, **given)
     echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")
