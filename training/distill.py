@@ -135,7 +135,7 @@ def train_layers(unet: UNet2DConditionModel) -> None:
 def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, init: Path | None = None) -> None:
     """Adds the LoRA layers of student and critic to a network; only these are trained.
 
-    The student's begin as those stored in the folder `init`, if there is one.
+    The student's begin as those stored in the folder `init`, if there is one, and have their rank.
     """
     ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's own
     kind = needed("peft").LoraConfig
