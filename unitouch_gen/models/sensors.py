@@ -121,11 +121,7 @@ class SensorBank(nn.Module):
 
     def encode(self, encoder: Callable[..., Tensor], inputs: Tensor, indices: Tensor) -> Tensor:
         """An encoder's output for inputs (B, ...) with the tokens of their sensors; index -1 has none."""
-        rows_of: dict[bool, list[int]] = {}
-        for row, index in enumerate(indices.tolist()):
-            rows_of.setdefault(index >= 0, []).append(row)
-        parts, order = [], list[int]()
-        for has_tokens, rows in rows_of.items():
-            parts.append(encoder(inputs[rows], self.tokens[indices[rows].long()] if has_tokens else None))
-            order += rows
-        return torch.cat(parts)[torch.tensor(order).argsort()]
+        known, others = (rows.nonzero()[:, 0] for rows in (indices >= 0, indices < 0))
+        parts = [encoder(inputs[known], self.tokens[indices[known].long()])] if len(known) else []
+        parts += [encoder(inputs[others], None)] if len(others) else []
+        return torch.cat(parts)[torch.cat([known, others]).argsort()]
