@@ -135,7 +135,7 @@ def train_layers(unet: UNet2DConditionModel) -> None:
 def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, init: Path | None = None) -> None:
     """Adds the LoRA layers of student and critic to a network; only these are trained.
 
-    The student's begin as those stored in the folder `init`, if there is one, and have their rank.
+    The student's begin as those stored in the folder `init`, if there is one.
     """
     ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's own
     kind = needed("peft").LoraConfig
@@ -144,8 +144,10 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, in
     if init is not None:
         with reading("init", init):
             unet.load_lora_adapter(init, prefix="unet", adapter_name=STUDENT, use_safetensors=True)
-        if not getattr(unet, "peft_config", None):
-            raise InvalidInputError(f"`init` is {str(init)!r}, which holds no LoRA weights of a UNet.")
+        held = getattr(unet, "peft_config", {}).get(STUDENT)
+        if held is None or held.r != ranks[STUDENT]:
+            holds = "no LoRA weights of a UNet" if held is None else f"layers of rank {held.r}; set `lora.r` to that"
+            raise InvalidInputError(f"`init` is {str(init)!r}, which holds {holds}.")
         del configs[STUDENT]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers

@@ -146,16 +146,17 @@ def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
     (checkpoints_in(tmp_path / "again")[-1] / "progress.json").unlink()
     words = words_of(tmp_path / "teacher", tmp_path / "again", cache, "--resume")
     assert not run_commands(commands, "unitouch-gen", ["distill", *words])
-    layers, again = (
-        load_file(tmp_path / run / "model" / "pytorch_lora_weights.safetensors") for run in ("run", "again")
-    )
+    further = ["--init", str(tmp_path / "run" / "model"), "--set", "trainer.learning_rate=1e-9"]
+    run("distill", DistillRecipe, main, words_of(tmp_path / "teacher", tmp_path / "further", cache, *further))
+    wide = words_of(tmp_path / "teacher", tmp_path / "wide", cache, *further, "--set", "lora.r=3")
+    with pytest.raises(SystemExit, match="2"):
+        run("distill", DistillRecipe, main, wide)
+    stored = "model/pytorch_lora_weights.safetensors"
+    layers, again, still = (load_file(tmp_path / run / stored) for run in ("run", "again", "further"))
+    assert_close(still, layers, atol=1e-6, rtol=1e-3)
     assert layers.keys() == again.keys() and all(torch.equal(again[key], value) for key, value in layers.items())
     assert {value.dtype for value in layers.values()} == {torch.float16}
     assert any(bool(value.abs().max() > 0) for key, value in layers.items() if "lora_B" in key or ".up." in key)
-    still = ["--init", str(tmp_path / "run" / "model"), "--set", "trainer.learning_rate=1e-9"]
-    run("distill", DistillRecipe, main, words_of(tmp_path / "teacher", tmp_path / "further", cache, *still))
-    further = load_file(tmp_path / "further" / "model" / "pytorch_lora_weights.safetensors")
-    assert_close(further, layers, atol=1e-6, rtol=1e-3)
     assert json.loads((tmp_path / "further" / "record.json").read_text())["started_from"]["stage"] == "distill"
 
     pipe.scheduler = LCMScheduler.from_config(pipe.scheduler.config)

@@ -67,8 +67,7 @@ def run(kind: str, power: float, gain: float = 0.0, beside: Tensor | None = None
 def test_targets_have_unit_variance_and_steps_the_law_of_a_power(kind: str, power: float) -> None:
     loss, _, network = run(kind, power)
     assert loss == pytest.approx(1.0, abs=0.05)  # what a prediction of zero costs, of either target
-    uniform = (network.steps + 0.5) / 1000
-    assert kstest(uniform.numpy() ** (1 / power), "uniform").pvalue > 0.01
+    assert kstest(((network.steps + 0.5) / 1000).numpy() ** (1 / power), "uniform").pvalue > 0.01
 
 
 def test_the_loss_is_of_the_noise_that_was_added() -> None:
