@@ -123,7 +123,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     embedding_bank: Any = None  # touch-to-text has none
     _card = Card()
 
-    def _finish_init(self, network: str, **defaults: float) -> None:
+    def _finish_init(self, network: str, **defaults: Any) -> None:
         """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
@@ -157,9 +157,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     def _check_call(
         self, inputs: int, num_images_per_prompt: Any, height: Any, width: Any, num_inference_steps: Any,
-        guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any, generator: Any, latents: Any,
-        output_type: Any, cross_attention_kwargs: Any, callback: Any, callback_inputs: Any, throw: Any,
-        init_strength: Any = 1.0,
+        timesteps: Any, guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any,
+        generator: Any, latents: Any, output_type: Any, cross_attention_kwargs: Any, callback: Any,
+        callback_inputs: Any, throw: Any, init_strength: Any = 1.0,
     ) -> CallSettings:  # fmt: skip
         """The validated arguments of a call with `inputs` inputs; `None` is the checkpoint's default."""
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, 100_000)
@@ -168,11 +168,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
         check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
         scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_SCALE)
-        if tolerance is None:
+        if (num_inference_steps, solver, tolerance, init_strength) == (None, None, None, 1.0):
+            timesteps = self._default("timesteps", timesteps)
+        if timesteps is None and tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         steps = prepare_steps(
-            self.scheduler, num_inference_steps=num_inference_steps, solver=solver, tolerance=tolerance,
-            max_evaluations=max_evaluations, eta=eta, init_strength=init_strength, device=self._execution_device,
+            self.scheduler, num_inference_steps=num_inference_steps, timesteps=timesteps, solver=solver,
+            tolerance=tolerance, max_evaluations=max_evaluations, eta=eta, init_strength=init_strength,
+            device=self._execution_device,
         )  # fmt: skip
         return CallSettings(
             shape=self._check_shape(inputs * repeats, height, width, generator, latents), repeats=repeats,

@@ -98,7 +98,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             }
         if name in TURBO:
             parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
-            parts |= {"default_num_inference_steps": 4, "default_guidance_scale": 1.0}
+            parts |= read_settings("family", folder / "turbo" / "defaults.json")
             with_lora(parts["unet"], folder / "turbo")
         pipe = kind(**parts)
         pipe._card = _card(family, name)

@@ -61,8 +61,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         processor: Preprocesses touch images for `unitouch`.
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
         embedding_bank: Image embeddings of the bridge; `None` for no bridge.
-        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: Defaults of a call;
-            here the paper's values.
+        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level, default_timesteps:
+            Defaults of a call; here the paper's values.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
@@ -79,6 +79,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         tokenizer: CLIPTokenizer | None = None, text_encoder: CLIPTextModel | None = None,
         embedding_bank: EmbeddingBank | None = None, default_strength: float = 0.75,
         default_guidance_scale: float = 9.0, default_num_inference_steps: int = 50, default_noise_level: int = 0,
+        default_timesteps: list[int] | None = None,
     ):  # fmt: skip
         super().__init__()
         self.register_modules(
@@ -92,6 +93,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         self._finish_init(
             "the unCLIP model", default_strength=default_strength, default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps, default_noise_level=default_noise_level,
+            default_timesteps=default_timesteps,
         )  # fmt: skip
 
     @property
@@ -106,7 +108,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         self,
         touch: ImageInput = None, prompt: str | list[str] | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        guidance_scale: float | None = None,
+        timesteps: Sequence[int] | None = None, guidance_scale: float | None = None,
         strength: float | None = None, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
         sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
@@ -124,6 +126,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             prompt: One prompt, or one for each touch; default "high quality".
             height, width: Picture size in pixels; multiples of the VAE's scale factor.
             num_inference_steps: Number of solver steps.
+            timesteps: Those at which the pipeline's own scheduler evaluates the network, falling, in place of their
+                number, for distilled weights that were learnt at them.
             guidance_scale: s of classifier-free guidance, >= 0; active above 1.
             strength: Factor on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: Prompt of the unconditional branch; default empty.
@@ -183,9 +187,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         touches = None if touch is None else self._prepare_touch(touch, sensor, background)
         inputs = len(embeds if touches is None else touches.pixels)
         settings = self._check_call(
-            inputs, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
-            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
-            callback_on_step_end_tensor_inputs, throw,
+            inputs, num_images_per_prompt, height, width, num_inference_steps, timesteps, guidance_scale, solver,
+            tolerance, max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs,
+            callback_on_step_end, callback_on_step_end_tensor_inputs, throw,
         )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
         positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)

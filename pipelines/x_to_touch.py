@@ -58,7 +58,8 @@ class XToTouchPipeline(UniTouchPipeline):
         embedding_bank: Image embeddings of the bridge; `None` for no bridge.
         sensors: Names of the UNet's class labels; empty for a UNet without.
         backgrounds: Background latents of `sensors`; `None` for a UNet without backgrounds or named sensors.
-        default_guidance_scale, default_num_inference_steps: Defaults of a call; here the paper's values.
+        default_guidance_scale, default_num_inference_steps, default_timesteps: Defaults of a call; here the paper's
+            values.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
@@ -76,6 +77,7 @@ class XToTouchPipeline(UniTouchPipeline):
         backgrounds: SensorBackgrounds | None = None,
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of other annotations
         default_guidance_scale: float = 7.5, default_num_inference_steps: int = 200,
+        default_timesteps: list[int] | None = None,
     ):  # fmt: skip
         super().__init__()
         self.register_modules(
@@ -85,7 +87,7 @@ class XToTouchPipeline(UniTouchPipeline):
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
             "`unet`", default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps,
+            default_num_inference_steps=default_num_inference_steps, default_timesteps=default_timesteps,
         )  # fmt: skip
         if unet.config.class_embed_type is not None:
             kind = unet.config.class_embed_type
@@ -141,7 +143,7 @@ class XToTouchPipeline(UniTouchPipeline):
         touch: ImageInput = None, sensor: SensorNames = None, background: ImageInput = None,
         weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        guidance_scale: float | None = None,
+        timesteps: Sequence[int] | None = None, guidance_scale: float | None = None,
         num_images_per_prompt: int = 1, source_sensor: SensorNames = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
         generator: Generators = None, latents: Tensor | None = None, condition_embeds: Tensor | None = None,
@@ -195,9 +197,9 @@ class XToTouchPipeline(UniTouchPipeline):
         gels, sensor_labels = self._check_sensor(sensor, background, inputs)
         batch_size = len(sensor_labels)
         settings = self._check_call(
-            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
-            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
-            callback_on_step_end_tensor_inputs, throw,
+            batch_size, num_images_per_prompt, height, width, num_inference_steps, timesteps, guidance_scale, solver,
+            tolerance, max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs,
+            callback_on_step_end, callback_on_step_end_tensor_inputs, throw,
         )  # fmt: skip
 
         # 2. Encode the condition

@@ -2,12 +2,14 @@
 
     python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
 
-The student is the network with LoRA layers. It draws in the steps of diffusers' `LCMScheduler`, and learns to draw
-what guided sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers
-that learn to denoise what the student draws, and moved where the network's guided prediction differs from the critic's.
-The result is a LoRA file. Pipelines use it with that scheduler and a `guidance_scale` of 1, since guidance is learnt.
+The student is the network with LoRA layers. It draws as diffusers' `LCMScheduler` does, and learns to draw what guided
+sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers that learn to
+denoise what the student draws, and moved where the network's guided prediction differs from the critic's. The result is
+a LoRA file. Pipelines use it with that scheduler, the same timesteps, and a `guidance_scale` of 1, since guidance is
+learnt; `defaults.json` beside it says so.
 """
 
+import json
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +26,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice, needed
 from unitouch_gen.files import class_name, read_settings, reading
 from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
+from unitouch_gen.sampling import prepare_steps
 from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
@@ -41,7 +44,7 @@ Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 class DistillSettings(Settings):
     """How the student is taught."""
 
-    steps: Annotated[int, Field(ge=1, le=50)]  # of `LCMScheduler`, in which the student draws
+    timesteps: list[int]  # at which the student draws, falling
     margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
     critic_rank: PositiveInt  # of the critic's LoRA layers, which are not kept
 
@@ -66,8 +69,7 @@ class DistillObjective(nn.Module):
         self.trained, self.scheduler, self.settings, self.guidance_scale = unet, scheduler, settings, guidance_scale
         self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
         self.schedule, lcm = NoiseSchedule.of(scheduler), LCMScheduler.from_config(scheduler.config)
-        lcm.set_timesteps(settings.steps)
-        self.timesteps = lcm.timesteps.tolist()
+        self.timesteps = prepare_steps(lcm, timesteps=settings.timesteps).timesteps.tolist()
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         shape, device = batch["latents"].shape, batch["latents"].device
@@ -215,6 +217,10 @@ def main(stage: Stage) -> None:
     with stage.saving() as place:
         halves = {name: tensor.half() for name, tensor in layers.items()}
         StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)
+        timesteps = recipe.objective.timesteps
+        defaults = {"num_inference_steps": len(timesteps), "timesteps": timesteps, "guidance_scale": 1.0}
+        settings = {f"default_{name}": value for name, value in defaults.items()}
+        (place / "defaults.json").write_text(json.dumps(settings, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -127,23 +127,24 @@ class Steps:
 
 def prepare_steps(
     scheduler: SchedulerMixin, *, solver: str | None = None, num_inference_steps: int | None = None,
-    tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0, init_strength: float = 1.0,
-    device: torch.device | str = "cpu",
+    timesteps: Sequence[int] | None = None, tolerance: float | None = None, max_evaluations: int | None = None,
+    eta: float = 0.0, init_strength: float = 1.0, device: torch.device | str = "cpu",
 ) -> Steps:  # fmt: skip
     """Validates the step arguments of a call, before any network runs.
 
-    `num_inference_steps` (default 50) or `tolerance`, a relative RMS error of the latents from 1e-5 to 1, sets the
-    steps. Without `solver` and `tolerance` a copy of the pipeline's own scheduler runs; otherwise only its noise levels
-    and prediction type are used. `max_evaluations` (default 1000) is of a tolerance, `eta` of DDIM. `init_strength` is
-    the share of the steps to run (img2img): they begin at that share of the way to noise, in the spacing of the solver
-    or scheduler, whatever their number. Raises `InvalidInputError` or `InvalidTypeError` if steps are impossible or
-    arguments exclude each other.
+    `num_inference_steps` (default 50), `timesteps` of the pipeline's own scheduler, or `tolerance`, a relative RMS
+    error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of that scheduler runs;
+    otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of a tolerance,
+    `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of the way to
+    noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or
+    `InvalidTypeError` if steps are impossible or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
     if tolerance is not None:
-        check_unused("tolerance", num_inference_steps=num_inference_steps, solver=solver, eta=eta or None)
+        given = {"num_inference_steps": num_inference_steps, "timesteps": timesteps, "solver": solver}
+        check_unused("tolerance", **given, eta=eta or None)
         check_number("tolerance", tolerance, 1e-5, 1.0)
         limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
         schedule, prediction_type = trained_for(scheduler)
@@ -151,6 +152,15 @@ def prepare_steps(
         return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
     if max_evaluations is not None:
         raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
+    if timesteps is not None:
+        partial = init_strength if init_strength < 1.0 else None
+        check_unused("timesteps", num_inference_steps=num_inference_steps, solver=solver, init_strength=partial)
+        highest = config.get("num_train_timesteps", 1000) - 1
+        check_kind("timesteps", timesteps, list, tuple)
+        falling = [check_integer("timesteps", timestep, 0, highest) for timestep in timesteps]
+        if not falling or falling != sorted(set(falling), reverse=True):
+            raise InvalidInputError(f"`timesteps` is {describe(timesteps)}; each has to be below the one before.")
+        return prepare_scheduler(copy.deepcopy(scheduler), falling, eta, 1.0, device)
     whole = 50 if num_inference_steps is None else num_inference_steps
     check_integer("num_inference_steps", whole, 1, config.get("num_train_timesteps", 1000))
     count = max(round(init_strength * whole), 1)
@@ -169,17 +179,21 @@ def trained_for(scheduler: Any) -> tuple[NoiseSchedule, str]:
 
 
 def prepare_scheduler(
-    scheduler: Any, count: int, eta: float, init_strength: float, device: torch.device | str
+    scheduler: Any, steps: int | list[int], eta: float, init_strength: float, device: torch.device | str
 ) -> Steps:
-    """Sets the timesteps of a diffusers scheduler."""
-    kind, words = type(scheduler).__name__, f"`num_inference_steps` is {count}"
-    options: dict[str, Any] = {"device": device}
+    """Sets the timesteps of a diffusers scheduler, by their number or one by one."""
+    kind, known = type(scheduler).__name__, inspect.signature(scheduler.set_timesteps).parameters
+    name = "num_inference_steps" if isinstance(steps, int) else "timesteps"
+    words = f"`{name}` is {steps}"
+    options: dict[str, Any] = {name: steps, "device": device}
+    if name not in known:
+        raise InvalidInputError(f"{words}, but {kind} chooses its own; pass `num_inference_steps`.")
     try:
-        if "strength" in inspect.signature(scheduler.set_timesteps).parameters:  # as of LCM and TCD
+        if "strength" in known:  # as of LCM and TCD
             options["strength"] = init_strength
         elif init_strength < 1.0:
             scheduler = begun_within(scheduler, init_strength)
-        scheduler.set_timesteps(count, **options)
+        scheduler.set_timesteps(**options)
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
@@ -190,7 +204,8 @@ def prepare_scheduler(
         )
     if hasattr(scheduler, "set_begin_index"):
         scheduler.set_begin_index(0)  # without it diffusers starts at the second of two equal timesteps
-    return Steps(kind, scheduler.num_inference_steps, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
+    count = scheduler.num_inference_steps if isinstance(steps, int) else len(steps)
+    return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
 
 
 def begun_within(scheduler: Any, share: float) -> Any:

@@ -1,5 +1,6 @@
 """The built-in family as pipelines: what it is made of, how it is read, steps to a tolerance, four evaluations."""
 
+import json
 import shutil
 
 import pytest
@@ -91,6 +92,9 @@ def test_diffusers_own_pipeline_makes_the_same_picture():
 # In four evaluations: LoRA weights under diffusers' `LCMScheduler` ---------------------------------------------------
 
 
+LEVELS = [999, 619, 299, 79]
+
+
 @pytest.fixture(scope="module")
 def family(tmp_path_factory):
     peft, folder = pytest.importorskip("peft", reason="LoRA needs peft"), tmp_path_factory.mktemp("family")
@@ -101,6 +105,8 @@ def family(tmp_path_factory):
         pipe.unet.add_adapter(peft.LoraConfig(r=2, target_modules=["to_q", "conv1"], init_lora_weights=False))
         layers = peft.get_peft_model_state_dict(pipe.unet, adapter_name="default")
         pipe.save_lora_weights(folder / name / "turbo", unet_lora_layers=layers)
+        defaults = {"default_num_inference_steps": 4, "default_timesteps": LEVELS, "default_guidance_scale": 1.0}
+        (folder / name / "turbo" / "defaults.json").write_text(json.dumps(defaults))
     return folder
 
 
@@ -132,9 +138,9 @@ def test_it_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo,
 def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo, name, family):
     pipe = quiet(unitouch_gen.tiny(TURBO[name], family=family))
     pipe.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
-    plain = draw(pipe, name, num_inference_steps=4, guidance_scale=1.0).images
+    plain = draw(pipe, name, timesteps=LEVELS, guidance_scale=1.0).images
     pipe.load_lora_weights(family / TURBO[name] / "turbo")
-    expected = draw(pipe, name, num_inference_steps=4, guidance_scale=1.0).images
+    expected = draw(pipe, name, timesteps=LEVELS, guidance_scale=1.0).images
     assert_close(draw(turbo, name).images, expected, atol=1e-4, rtol=1e-3)
     assert not torch.allclose(expected, plain, atol=1e-2)
 

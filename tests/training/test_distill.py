@@ -26,7 +26,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
-SETTINGS = DistillSettings(steps=4, margin=0.02, critic_rank=2)
+SETTINGS = DistillSettings(timesteps=[999, 619, 299, 79], margin=0.02, critic_rank=2)
 SCHEDULE = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012, "clip_sample": False}
 LORA = {"r": 2, "target_modules": ["to_q", "to_v", "conv1"]}
 
@@ -84,7 +84,7 @@ def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None
         found = objective.drawn(noise, conditions)
         torch.manual_seed(seed)
         last, z = int(torch.randint(4, ())), noise
-        lcm.set_timesteps(4)
+        lcm.set_timesteps(timesteps=objective.timesteps)
         with torch.no_grad():
             for t in lcm.timesteps[: last + 1]:
                 z, denoised = lcm.step(unet(z, t, **conditions).sample, t, z, return_dict=False)

@@ -11,7 +11,7 @@ from typer import Exit, Option, echo
 from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, did_you_mean
-from unitouch_gen.files import reading
+from unitouch_gen.files import read_settings, reading
 from unitouch_gen.weights import FAMILY
 
 
@@ -62,15 +62,18 @@ def work_precision(
     else:
         name = check_choice("--pipeline", pipeline, DRAWING)
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
-        student = None
+        student, settings = None, dict[str, Any]()
         if lora is not None and "turbo" in names:
             from unitouch_gen.pipelines.tiny import with_lora
 
             with reading("--lora", lora):
                 student = with_lora(copy.deepcopy(pipe.unet), lora)
+                if (lora / "defaults.json").is_file():
+                    settings = read_settings("--lora", lora / "defaults.json")
         target = wp.pipeline_target(
-            pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, student=student
-        )
+            pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, student=student,
+            timesteps=settings.get("default_timesteps"),
+        )  # fmt: skip
         if "default" in names:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up

@@ -59,6 +59,7 @@ class Target:
     own_error: float = 0.0  # of the truth, median; 0 for a closed form
     default_steps: int | None = None  # of a pipeline
     turbo: Network | None = None  # which needs no guidance
+    turbo_timesteps: Sequence[int] | None = None  # that it was distilled for, if not those of `LCMScheduler`
 
 
 def problem_target(problem: Problem, seeds: int = 8) -> Target:
@@ -71,7 +72,7 @@ def problem_target(problem: Problem, seeds: int = 8) -> Target:
 @torch.no_grad()
 def pipeline_target(
     pipe: Any, inputs: Mapping[str, Tensor], *, name: str = "", seeds: int = 2, guidance_scale: float | None = None,
-    rtol: float = 1e-4, student: Any = None, **options: Any,
+    rtol: float = 1e-4, student: Any = None, timesteps: Sequence[int] | None = None, **options: Any,
 ) -> Target:  # fmt: skip
     """The network of a pipeline under conditions, from some noises each.
 
@@ -80,7 +81,7 @@ def pipeline_target(
         seeds: Noises for each condition.
         rtol: Tolerance of the reference. A trained network ripples with the waves of the timestep's embedding, by about
             one percent over some ten levels; far below this tolerance solvers follow every ripple.
-        student: A UNet that was distilled from the pipeline's, for "turbo".
+        student, timesteps: A UNet that was distilled from the pipeline's, for "turbo", and what it was distilled for.
     """
     guidance = Guidance(pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale)
     seen: list[tuple[Tensor, dict[str, Any]]] = []
@@ -114,7 +115,8 @@ def pipeline_target(
     truth, disagreement = solve_reference(denoise, noise, schedule, rtol)
     own_error, steps = disagreement.median().item(), pipe.config["default_num_inference_steps"]
     turbo = None if student is None else partial(network, unet=student)
-    return Target(name, network, scheduler, guidance, noise.to(states.device), truth, own_error, steps, turbo)
+    noise = noise.to(states.device)
+    return Target(name, network, scheduler, guidance, noise, truth, own_error, steps, turbo, timesteps)
 
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor]:
@@ -144,8 +146,11 @@ def measure(
         kind, settings = BASELINES[solver]
         scheduler = kind(**{name: scheduler.config[name] for name in TRAINED}, **settings)
     named, seconds, report = solver if solver in SOLVERS else None, [], RunReport()
+    given: dict[str, Any] = {"num_inference_steps": steps}
+    if solver == "turbo" and target.turbo_timesteps and len(target.turbo_timesteps) == steps:
+        given = {"timesteps": target.turbo_timesteps}
     try:
-        prepared = prepare_steps(scheduler, solver=named, num_inference_steps=steps, tolerance=tolerance)
+        prepared = prepare_steps(scheduler, solver=named, tolerance=tolerance, **given)
         for _ in range(repeats):
             report, started = RunReport(), time.perf_counter()
             added = torch.Generator().manual_seed(1)  # noise of some schedulers, other than what they start from
