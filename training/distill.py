@@ -18,15 +18,14 @@ import torch
 from diffusers import DDPMScheduler, LCMScheduler, UNet2DConditionModel
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from pydantic import Field, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, needed
+from unitouch_gen.errors import InvalidInputError, check_choice, first_line, needed
 from unitouch_gen.files import class_name, read_settings, reading
 from unitouch_gen.models.autoencoders import read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
-from unitouch_gen.sampling import prepare_steps
 from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
@@ -44,7 +43,7 @@ Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 class DistillSettings(Settings):
     """How the student is taught."""
 
-    timesteps: list[int]  # at which the student draws, falling
+    timesteps: Annotated[list[NonNegativeInt], Field(min_length=1)]  # at which the student draws, falling
     margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
     critic_rank: PositiveInt  # of the critic's LoRA layers, which are not kept
 
@@ -69,7 +68,11 @@ class DistillObjective(nn.Module):
         self.trained, self.scheduler, self.settings, self.guidance_scale = unet, scheduler, settings, guidance_scale
         self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
         self.schedule, lcm = NoiseSchedule.of(scheduler), LCMScheduler.from_config(scheduler.config)
-        self.timesteps = prepare_steps(lcm, timesteps=settings.timesteps).timesteps.tolist()
+        try:
+            lcm.set_timesteps(timesteps=settings.timesteps)
+        except ValueError as error:
+            raise InvalidInputError(f"`objective.timesteps` is {settings.timesteps}: {first_line(error)}") from error
+        self.timesteps = settings.timesteps
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         shape, device = batch["latents"].shape, batch["latents"].device

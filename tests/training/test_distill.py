@@ -204,6 +204,7 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
         ("broken", "", "`model` is "),
         ("teacher", "--set lora.target_modules=[to_p]", "`lora` does not fit the network"),
         ("teacher", "--set lora.rank=3", "In `lora`, `rank` is unknown"),
+        ("teacher", "--set objective.timesteps=[9,99]", "`objective.timesteps` is [9, 99]: "),
         ("gels", f"--set data.sets=[{mine}]", "`data.sets` have no untouched gels"),
     ):
         given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split(maxsplit=1))
