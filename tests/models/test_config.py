@@ -26,7 +26,6 @@ TRANSFORMER = [
     ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_size"),
     ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "patch_size"),
     ({"mlp_ratio": "4"}, "mlp_ratio"),
-    ({"drop_path": 1.0}, "drop_path"),
 ]
 JOINT_SPACE = [
     ({"sensor_tokens": 0}, "sensor_tokens"),

@@ -38,7 +38,6 @@ class UniTouchViTConfig(PreTrainedConfig):
         stem_norm: LayerNorm after the stem (eps 1e-5), as in ImageBind's audio trunk.
         add_bias_kv: One learned key and value appended to every sequence.
         layer_norm_eps: Of all other norms.
-        drop_path: Probability of skipping a branch of the last block in training; it falls linearly to 0 at the first.
         projection_dim: Width D of the joint space.
         patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
     """
@@ -58,7 +57,6 @@ class UniTouchViTConfig(PreTrainedConfig):
     stem_norm: bool = False
     add_bias_kv: bool = True
     layer_norm_eps: float = 1e-6
-    drop_path: float | int = 0.0
     projection_dim: int = 1024
     patch_channels: int = 0
 
@@ -70,7 +68,6 @@ class UniTouchViTConfig(PreTrainedConfig):
         check_integer("patch_channels", self.patch_channels, 0)
         check_number("mlp_ratio", self.mlp_ratio, 1e-3)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
-        check_number("drop_path", self.drop_path, 0.0, 0.999)
         if self.hidden_size % self.num_attention_heads:
             heads = f"`num_attention_heads` ({self.num_attention_heads})"
             raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
