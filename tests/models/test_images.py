@@ -161,7 +161,7 @@ def test_a_photo_that_moves_is_its_first_frame_and_told(processor: UniTouchProce
     first, other = Image.fromarray(PICTURE), Image.fromarray(255 - PICTURE)
     first.save(tmp_path / "photo.png", save_all=True, append_images=[other])
     with pytest.warns(UserWarning, match="has 2 frames"):
-        found = processor.touch(tmp_path / "photo.png")  # too few for a contact
+        found = processor.touch(tmp_path / "photo.png")
     torch.testing.assert_close(denormalise_pixels(found), pixels_of(PICTURE / 255), rtol=0, atol=1e-5)
 
 
