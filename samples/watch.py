@@ -3,17 +3,75 @@
 python samples/watch.py 0 --output outputs/watched    # the first camera, on Linux; Ctrl-C ends it
 python samples/watch.py press.mp4
 
-Leave the sensor alone for the first moment: the gel at rest is seen in the first quiet frames.
+Leave the sensor alone for the first moment: the gel at rest is seen in the first frames.
 """
 
 import argparse
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 import unitouch_gen
-from unitouch_gen.models.videos import contacts, read_video
+from unitouch_gen.models.videos import LEAST_CHANGE, change_of, read_video
+
+REST = 5  # frames whose median is the gel at rest
+SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A frame, uint8 (H, W, 3), its number, and its mean difference from the gel at rest, of full scale."""
+
+    frame: np.ndarray
+    index: int
+    firmness: float
+
+
+def camera(number: str) -> Iterator[np.ndarray]:
+    """Frames (H, W, 3) of a camera, uint8 RGB."""
+    import av
+
+    with av.open(f"/dev/video{number}", format="v4l2") as container:
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="rgb24")
+
+
+def as_batch(frame: np.ndarray) -> Tensor:
+    return torch.from_numpy(frame.copy()).permute(2, 0, 1)[None]
+
+
+def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
+    """Contacts of a stream, each when it is as firm as it gets; and again if it gets firmer by a twentieth."""
+    numbered = enumerate(frames)
+    first = torch.cat([as_batch(frame) for _, (_, frame) in zip(range(REST), numbered, strict=False)])
+    rest = first.median(dim=0, keepdim=True).values
+    least = max(LEAST_CHANGE, 3.0 * change_of(first, rest).max().item())  # more where they are noisy
+
+    recent = deque[Contact](maxlen=3)
+    best, due, age = None, False, 0  # due: yet to be yielded; age: frames since it was as firm
+    for index, frame in numbered:
+        change = change_of(as_batch(frame), rest)
+        let_go = change.max().item() < least
+        if not let_go:
+            recent.append(Contact(frame, index, change.mean().item()))
+            middle = sorted(recent, key=lambda one: one.firmness)[len(recent) // 2]  # a broken frame is never it
+            age += 1
+            if len(recent) == 3 and (best is None or middle.firmness > (1.0 if due else 1.05) * best.firmness):
+                best, due, age = middle, True, 0
+        if due and best is not None and (let_go or age >= SETTLED):
+            yield best
+            due = False
+        if let_go:
+            best = None
+            recent.clear()
+    if due and best is not None:
+        yield best
 
 
 def main() -> None:
@@ -24,16 +82,15 @@ def main() -> None:
     parser.add_argument("--bgr", action="store_true", help="frames have blue in the place of red")
     arguments = parser.parse_args()
 
-    if arguments.source.isdecimal():
-        frames = read_video("source", f"/dev/video{arguments.source}", form="v4l2")
-    else:
-        frames = read_video("source", arguments.source)
+    frames = camera(arguments.source) if arguments.source.isdecimal() else read_video("source", arguments.source)
+    if arguments.bgr:
+        frames = (frame[..., ::-1] for frame in frames)
     pipe = unitouch_gen.tiny("touch-to-image")
     pipe.set_progress_bar_config(disable=True)
     arguments.output.mkdir(parents=True, exist_ok=True)
     count = 0
     try:
-        for count, contact in enumerate(contacts(frames, "bgr" if arguments.bgr else "rgb", name="source"), 1):
+        for count, contact in enumerate(contacts(frames), 1):
             output = pipe(contact.frame, sensor=arguments.sensor, generator=torch.Generator().manual_seed(0))
             Image.fromarray(contact.frame).save(arguments.output / f"{count}-touch.png")
             output.images[0].save(arguments.output / f"{count}-picture.png")

@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
+import diffusers
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -17,15 +18,8 @@ from diffusers import AutoencoderTiny, VQModel
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models.autoencoders import (
-    Autoencoder,
-    autoencoder_class,
-    encode,
-    encode_raw,
-    read_autoencoder,
-    scale_factor,
-)
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.models.autoencoders import CLASSES, Autoencoder, encode, encode_raw, read_autoencoder, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
 from unitouch_gen.training.recipe import Arguments, Settings, build
@@ -103,8 +97,8 @@ def cached_latents(
 
 def make_autoencoder(model: Arguments) -> Autoencoder:
     """The autoencoder of a recipe's `model`."""
-    kind = autoencoder_class("model.class", model.get("class"))
-    return build("model", kind, {key: value for key, value in model.items() if key != "class"})
+    name = check_choice("model.class", model.get("class"), CLASSES)
+    return build("model", getattr(diffusers, name), {key: value for key, value in model.items() if key != "class"})
 
 
 def main(stage: Stage) -> None:

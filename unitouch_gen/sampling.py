@@ -72,7 +72,7 @@ class RunReport:
     #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)  #: sensor whose tokens each touch got
-    #: L1 distance of each touch (of its `background` if given) to that sensor's or the nearest prototype, 1: full scale
+    #: of each touch (of its `background` if given) to that or the nearest sensor; see `SensorBank.distances`
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig, UniTouchViTConfig
 
 
@@ -15,6 +15,7 @@ def test_a_config_survives_a_round_trip(config: UniTouchConfig, tmp_path: Path) 
         assert UniTouchConfig.from_pretrained(tmp_path).to_dict() == known.to_dict()
 
 
+REFUSALS = (InvalidInputError, InvalidTypeError)
 TRANSFORMER = [
     *(({"hidden_size": value}, "hidden_size") for value in (1000, "wide", 0)),
     *(({name: 0}, name) for name in ("num_attention_heads", "projection_dim", "patch_size", "patch_stride")),
@@ -25,7 +26,6 @@ TRANSFORMER = [
     ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_size"),
     ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "patch_size"),
     ({"mlp_ratio": "4"}, "mlp_ratio"),
-    ({"drop_path": 1.0}, "drop_path"),
 ]
 JOINT_SPACE = [
     ({"sensor_tokens": 0}, "sensor_tokens"),
@@ -35,11 +35,11 @@ JOINT_SPACE = [
     ({"projection_dim": "wide"}, "projection_dim"),
     ({"sensors": [1, 2]}, "sensors"),
     ({"sensors": ["digit", "gelsight", "digit"]}, "sensors"),
-    ({"sensor_reaches": {"digit": "large"}}, "sensor_reaches"),
+    ({"sensor_reaches": {"digit": "large"}}, r"sensor_reaches\['digit'\]"),
     ({"vision_config": {"hidden_size": "wide", "projection_dim": 1024}}, "hidden_size"),
     ({"vision_config": {"stem": "relief", "projection_dim": 1024}}, "vision_config.stem"),
     ({"vision_config": {"stem": "residual", "patch_size": 12, "projection_dim": 1024}}, "patch_size"),
-    ({"touch_config": {"stem": "resnet"}}, "stem"),
+    *(({"touch_config": value}, named) for value, named in (({"stem": "resnet"}, "stem"), (5, "touch_config"))),
     ({"audio_config": {"projection_dim": 17}}, "audio_config.projection_dim"),
 ]
 
@@ -47,8 +47,8 @@ JOINT_SPACE = [
 def test_what_cannot_be_built_is_refused_by_name(tmp_path: Path) -> None:
     for kind, table in ((UniTouchViTConfig, TRANSFORMER), (UniTouchConfig, JOINT_SPACE)):
         for changes, named in table:
-            with pytest.raises(InvalidInputError, match=f"`{named}`"):
+            with pytest.raises(REFUSALS, match=named):
                 kind(**changes)
             (tmp_path / "config.json").write_text(json.dumps(kind().to_dict() | changes))
-            with pytest.raises(InvalidInputError):
+            with pytest.raises(REFUSALS):
                 kind.from_pretrained(tmp_path)

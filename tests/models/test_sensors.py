@@ -54,7 +54,7 @@ def test_a_bank_of_none_matches_none() -> None:
 def test_an_image_out_of_reach_of_all_is_of_none_unless_the_nearest_is_asked_for() -> None:
     bank = reaching(dark=0.05, bright=0.05)
     assert [match.name for match in bank.match(levels(0.24, 0.26, 0.76))] == ["dark", None, "bright"]
-    assert bank.match(levels(0.26))[0].distance == pytest.approx(0.06)
+    assert bank.match(levels(0.26))[0].distance == pytest.approx(0.06 / 0.05, rel=1e-5)
     assert bank.match(levels(0.45), "bright")[0].name == "bright"
     assert bank.match(levels(0.45), nearest=True)[0].name == "dark"
 

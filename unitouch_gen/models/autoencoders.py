@@ -4,8 +4,9 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 """
 
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
+import diffusers
 import torch
 from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
@@ -15,22 +16,14 @@ from unitouch_gen.files import read_settings
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderTiny | VQModel
 
-CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderTiny, VQModel)}
-
-
-def autoencoder_class(argument: str, name: Any) -> Any:
-    """The class of that name in diffusers' configurations; raises an `InvalidInputError` if there is none."""
-    return CLASSES[check_choice(argument, name, CLASSES)]
-
-
-def stored_class(folder: Path) -> Any:
-    """The class of the autoencoder in a folder."""
-    return autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
+CLASSES = ("AutoencoderKL", "AutoencoderTiny", "VQModel")  # their classes' names in diffusers
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:
     """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
-    return stored_class(folder).from_pretrained(folder, use_safetensors=True).eval().requires_grad_(False)
+    name = check_choice("vae", read_settings("vae", folder / "config.json").get("_class_name"), CLASSES)
+    vae = getattr(diffusers, name).from_pretrained(folder, use_safetensors=True)
+    return vae.eval().requires_grad_(False)
 
 
 def scale_factor(vae: Autoencoder) -> int:

@@ -1,39 +1,19 @@
 """Configurations of the joint space, whose defaults are the paper's size.
 
-A value of a wrong type or out of range, or that does not fit the others, is an `InvalidInputError`.
+A value of a wrong type is an `InvalidTypeError`; one out of range, or that does not fit the others, an
+`InvalidInputError`.
 """
 
-import re
 from dataclasses import field
-from functools import wraps
-from typing import Any, TypeVar
+from types import NoneType
+from typing import Any
 
-from huggingface_hub.dataclasses import strict
 from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, first_line
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number, check_texts
 from unitouch_gen.files import saved_whole
-
-Config = TypeVar("Config", bound=type)
-
-
-def validated(cls: Config) -> Config:
-    """huggingface's `strict`, raising `InvalidInputError`: its own error is no `ValueError`."""
-    strict(cls)
-    build: Any = cls.__init__  # type: ignore[misc]
-
-    @wraps(build)
-    def build_checked(self: Any, *args: Any, **settings: Any) -> None:
-        try:
-            build(self, *args, **settings)
-        except StrictDataclassError as error:
-            said = first_line(error.__cause__ or error)
-            raise InvalidInputError(re.sub(r"(?:[Ff]ield|dict) '(\w+)'", r"`\1`", said)) from error
-
-    cls.__init__ = build_checked  # type: ignore[misc]
-    return cls
 
 
 def check_halved(patch_size: int, *lengths: int) -> None:
@@ -45,7 +25,6 @@ def check_halved(patch_size: int, *lengths: int) -> None:
         )
 
 
-@validated
 class UniTouchViTConfig(PreTrainedConfig):
     """The transformer that touch and audio share (Section 4.1 of the paper: 24 blocks, 16 heads, width 1024).
 
@@ -59,7 +38,6 @@ class UniTouchViTConfig(PreTrainedConfig):
         stem_norm: LayerNorm after the stem (eps 1e-5), as in ImageBind's audio trunk.
         add_bias_kv: One learned key and value appended to every sequence.
         layer_norm_eps: Of all other norms.
-        drop_path: Probability of skipping a branch of the last block in training; it falls linearly to 0 at the first.
         projection_dim: Width D of the joint space.
         patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
     """
@@ -79,17 +57,17 @@ class UniTouchViTConfig(PreTrainedConfig):
     stem_norm: bool = False
     add_bias_kv: bool = True
     layer_norm_eps: float = 1e-6
-    drop_path: float | int = 0.0
     projection_dim: int = 1024
     patch_channels: int = 0
 
-    def validate_architecture(self) -> None:
-        """Called by huggingface's `strict`."""
+    def __post_init__(self, **kwargs: Any) -> None:
+        super().__post_init__(**kwargs)
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
                      "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
             check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
         check_integer("patch_channels", self.patch_channels, 0)
-        check_number("drop_path", self.drop_path, 0.0, 0.999)
+        check_number("mlp_ratio", self.mlp_ratio, 1e-3)
+        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         if self.hidden_size % self.num_attention_heads:
             heads = f"`num_attention_heads` ({self.num_attention_heads})"
             raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
@@ -112,7 +90,6 @@ AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12,
          "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
 
 
-@validated
 class UniTouchConfig(PreTrainedConfig):
     """The joint space of touch, image, text and audio.
 
@@ -154,11 +131,12 @@ class UniTouchConfig(PreTrainedConfig):
 
     def __post_init__(self, **kwargs: Any) -> None:
         kwargs.pop("auto_map", None)  # of the folder
-        super().__post_init__(**kwargs)
-        self.sensors = list(self.sensors)
-
-    def validate_architecture(self) -> None:
-        """Called by huggingface's `strict`."""
+        for name in self.sub_configs_defaults:
+            check_kind(name, getattr(self, name), dict, PreTrainedConfig, NoneType)
+        try:
+            super().__post_init__(**kwargs)
+        except StrictDataclassError as error:  # of CLIP's configurations; it is no `ValueError`
+            raise InvalidInputError(f"`vision_config` or `text_config`: {error.__cause__}") from error
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
         for name in ("temperature", "embedding_norm"):
@@ -170,5 +148,8 @@ class UniTouchConfig(PreTrainedConfig):
         stem = check_choice("vision_config.stem", getattr(vision, "stem", "patch"), ("patch", "residual"))
         if stem == "residual":
             check_halved(vision.patch_size, vision.image_size)
+        self.sensors = check_texts("sensors", self.sensors) if self.sensors else []
+        for name, reach in check_kind("sensor_reaches", self.sensor_reaches, dict).items():
+            check_number(f"sensor_reaches[{name!r}]", reach, 0.0)
         if len(set(self.sensors)) != len(self.sensors):
             raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")

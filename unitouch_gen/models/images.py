@@ -2,7 +2,6 @@
 
 import io
 import os
-import re
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -26,8 +25,9 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
     Accepts a path (image or .npy), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
     a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
-    files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`. Files and PIL images are in
-    the colours of their profile, and laid over white where they are transparent, as most viewers show them.
+    grey files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`; of files in colour, the
+    upper 8 of 16 bits. Files and PIL images are in the colours of their profile, and laid over white where they are
+    transparent, as most viewers show them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no whole image, one is too small or too large, an array has a
@@ -53,7 +53,7 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 
 def _decoded(name: str, image: Any) -> np.ndarray:
-    """Pixels of a file or a PIL image: uint8 (H, W, 3), or float32 (H, W) if deeper than 8 bits; or a file's array."""
+    """Pixels of a file or a PIL image: uint8 (H, W, 3), or float32 (H, W) if deep and grey; or a file's array."""
     subject = f"`{name}`" if isinstance(image, Image.Image) else f"`{name}` names {str(image)!r}, which"
     try:
         with warnings.catch_warnings():
@@ -66,14 +66,15 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         _check_size(name, *image.size)  # before its pixels are decoded
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
-        if (deep := _deep_colours(image)) is not None:
-            return _by_range(subject, deep[..., :3], deep[..., 3:])
-        inverted = getattr(image, "tag_v2", {}).get(262) == 0  # TIFF's WhiteIsZero, which Pillow heeds up to 8 bits
+        tags = getattr(image, "tag_v2", {})  # of TIFF: bits, whether zero is white, whether it is stored by planes
+        if tags.get(258, (8,))[0] > 8 and (tags.get(262) == 0 or tags.get(284) == 2):
+            kind = "a TIFF of more than 8 bits, of planes or with white as zero"
+            raise InvalidInputError(f"{subject} is {kind}, which Pillow misreads; save it as PNG.")
         image = ImageOps.exif_transpose(image)
         if image.mode == "F":
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
-            return _by_range(subject, np.asarray(image), inverted=inverted)
+            return _by_range(subject, np.asarray(image))
         profile = image.info.get("icc_profile") or b""
         if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
@@ -93,28 +94,7 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         ) from error
 
 
-def _deep_colours(image: Any) -> np.ndarray | None:
-    """Colours of 16 bits, uint16 (H, W, 3), or (H, W, 4) with their opacity; `None` of other images.
-
-    Pillow keeps one byte of each. Told the other order of bytes, it keeps the other one.
-    """
-    tiles = [(tile, tile.args if isinstance(tile.args, tuple) else (tile.args,)) for tile in getattr(image, "tile", ())]
-    kinds = [str(*args[:1]) for _, args in tiles]  # none once it is decoded
-    planes = {*kinds} == {"R", "G", "B"} and image.tag_v2[258][0] == 16  # which Pillow takes for 8 bits
-    if not planes and not (kinds and all(re.fullmatch("RGB[AX]?;16[BLN]", kind) for kind in kinds)):
-        return None
-    image.fp.seek(0)
-    content, found = image.fp.read(), []
-    for order in "BL":  # the first bytes, and the second ones
-        part: Any = Image.open(io.BytesIO(content))
-        part.seek(image.tell())
-        part.tile = [tile._replace(args=(f"{kind.split(';')[0]};16{order}", *args)) for tile, (kind, *args) in tiles]
-        found.append(np.asarray(ImageOps.exif_transpose(part)))
-    stored = image.tag_v2.prefix.decode()[0] if planes else kinds[0][-1]
-    return np.stack(found, axis=-1).view({"N": "=u2", "L": "<u2", "I": "<u2"}.get(stored, ">u2"))[..., 0]
-
-
-def _by_range(subject: str, values: np.ndarray, opacity: Any = None, inverted: bool = False) -> np.ndarray:
+def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
     """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
     low, high = int(values.min()), int(values.max())
     if low < 0 or high >= 1 << 16:
@@ -123,9 +103,6 @@ def _by_range(subject: str, values: np.ndarray, opacity: Any = None, inverted: b
     full = 2**bits - 1
     if bits < 16:
         warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full}.", stacklevel=2)
-    if opacity is not None and opacity.size:  # of 16 bits, (H, W, 1)
-        values = full - opacity / 65535 * (full - values)
-    values = full - values if inverted else values
     return values.astype(np.uint8) if bits == 8 else (values / full).astype(np.float32)
 
 

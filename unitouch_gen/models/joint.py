@@ -143,10 +143,7 @@ class UniTouchModel(PreTrainedModel):
     def match_sensors(self, pixel_values: Tensor, sensor: Sensors = None, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each touch (B, 3, S, S), named or retrieved; see `SensorBank.match`."""
         _, sensor_bank = self.load("touch")
-        raw, size = denormalise_pixels(pixel_values.float()), self.config.prototype_size
-        if len(sensor_bank) and raw.shape[-1] != size:
-            raw = F.interpolate(raw, (size, size), mode="bilinear", antialias=True)
-        return sensor_bank.match(raw, sensor, nearest=nearest)
+        return sensor_bank.match(denormalise_pixels(pixel_values.float()), sensor, nearest=nearest)
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor:
         """Bank indices (B,) of matches, -1 for a match without a name."""

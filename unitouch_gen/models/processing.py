@@ -78,7 +78,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
-        A video, an animated image or an iterator of frames is the firmest of its `contacts`.
+        Of a video or an iterator of frames it is the frame of firmest contact; see `videos.firmest`.
         """
         if isinstance(touch, list | tuple):
             return self.images([firmest(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)

@@ -15,8 +15,8 @@ Sensors = str | Sequence[str | None] | None
 
 @dataclass(frozen=True)
 class SensorMatch:
-    """The sensor whose tokens an image gets, `None` where it is none of the bank's; and the mean absolute difference to
-    its prototype, of full scale, `None` if not compared."""
+    """The sensor whose tokens an image gets, `None` where it is none of the bank's; and the distance to its prototype,
+    see `SensorBank.distances`, `None` if not compared."""
 
     name: str | None
     distance: float | None
@@ -80,9 +80,8 @@ class SensorBank(nn.Module):
     def match(self, raw_pixels: Tensor, sensor: Sensors = None, *, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each image (B, 3, S, S) in [0, 1]: the one named, or the one that is retrieved.
 
-        That is the nearest prototype by L1 distance, as in the paper. Where the bank has `reaches`, it is the one with
-        the least `layout_distances` over its reach, and none where the image is out of reach of all, unless the
-        `nearest` is asked for.
+        That is the nearest prototype by L1 distance, as in the paper, of the colours of areas. Where the bank has
+        `reaches`, it is none where the image is out of reach of all, unless the `nearest` is asked for.
         """
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
@@ -96,26 +95,19 @@ class SensorBank(nn.Module):
         if None in indices and not bool(self.known.any()):
             stored = "this model stores no prototypes to retrieve one by"
             raise InvalidInputError(f"`sensor` is None, but {stored}; name one of {self.names}.")
-        distances = self.distances(raw_pixels)
-        retrieved = self._shares_of_reach(raw_pixels) if self.reaches else distances
         matches = []
-        for index, row, by in zip(indices, distances, retrieved, strict=True):
-            chosen = int(by.argmin()) if index is None else index
-            out_of_reach = index is None and self.reaches and not nearest and by[chosen] > 1.0
-            distance = row[chosen].item() if self.known[chosen] else None
+        for index, row in zip(indices, self.distances(raw_pixels), strict=True):
+            chosen = int(row.argmin()) if index is None else index
+            out_of_reach = index is None and self.reaches and not nearest and row[chosen] > 1.0
+            distance = row[chosen].item() if row[chosen].isfinite() else None
             matches.append(SensorMatch(None if out_of_reach else self.names[chosen], distance))
         return matches
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
-        """Mean absolute difference of each image (B, 3, S, S) to each prototype, (B, K); infinite where unknown."""
-        flat = raw_pixels.flatten(1).to(self.prototypes)
-        gap = torch.stack([(flat - prototype).abs().mean(dim=1) for prototype in self.prototypes], dim=1)
-        return gap.masked_fill(~self.known, float("inf"))
-
-    def _shares_of_reach(self, raw_pixels: Tensor) -> Tensor:
-        """`layout_distances` to the prototypes over the sensors' reaches, (B, K); infinite where one is unknown."""
-        reaches = torch.tensor([self.reaches.get(name, 0.0) for name in self.names], device=self.prototypes.device)
+        """`layout_distances` of images (B, 3, S, S) to each prototype, (B, K), over the sensors' reaches where there
+        are any; infinite where a prototype or a reach is unknown."""
         looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
+        reaches = looks.new_tensor([self.reaches.get(name, 0.0) if self.reaches else 1.0 for name in self.names])
         distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
         return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
 

@@ -54,27 +54,19 @@ class StreamNorm(nn.LayerNorm):
 
 
 class Block(nn.Module):
-    """Attention and MLP, each behind a norm and dropped with a probability in training, (B, T, width) -> the same."""
+    """Attention and MLP, each behind a norm, (B, T, width) -> the same."""
 
-    def __init__(self, config: UniTouchViTConfig, drop_path: float):
+    def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
         self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
         self.attention = Attention(config)
         self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
-        self.drop_path = drop_path
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x + self._drop(self.attention(self.norm_1(x)))
-        return x + self._drop(self.mlp(self.norm_2(x)))
-
-    def _drop(self, branch: Tensor) -> Tensor:
-        """Stochastic depth (Huang et al., 2016), a sample at a time."""
-        if not self.training or self.drop_path == 0.0:
-            return branch
-        keep = torch.rand(len(branch), 1, 1, device=branch.device) >= self.drop_path
-        return branch * keep / (1.0 - self.drop_path)
+        x = x + self.attention(self.norm_1(x))
+        return x + self.mlp(self.norm_2(x))
 
 
 class LocalContrast(nn.Module):
@@ -155,7 +147,7 @@ class UniTouchViT(nn.Module):
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
-        width, depth = config.hidden_size, config.num_hidden_layers
+        width = config.hidden_size
         self.begins_at_mean = config.stem != "patch"
         if self.begins_at_mean:
             side = min(config.image_height, config.image_width)
@@ -166,7 +158,7 @@ class UniTouchViT(nn.Module):
         rows, columns = config.grid
         self.class_token = nn.Parameter(torch.zeros(1, 1, width))
         self.position = nn.Parameter(torch.zeros(1, 1 + rows * columns, width))
-        self.blocks = nn.ModuleList(Block(config, config.drop_path * i / max(depth - 1, 1)) for i in range(depth))
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.num_hidden_layers))
         self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
         self.patch_projection = PatchProjection(config, rows * columns) if config.patch_channels else None

@@ -3,22 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import (
-    InvalidInputError,
-    InvalidTypeError,
-    check_choice,
-    check_integer,
-    check_kind,
-    check_texts,
-    describe,
-    first_line,
-)
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts, describe
 from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
@@ -161,26 +153,17 @@ def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, sh
 
 def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
     """Sensors by name, or as they are; each once."""
-    found: dict[str, Sensor] = {}
-    for sensor in check_kind("sensors", sensors, list, tuple):
-        known = sensor if isinstance(sensor, Sensor) else SENSORS[check_choice("sensors", sensor, SENSORS)]
-        if found.setdefault(known.name, known) != known:
-            raise InvalidInputError("`sensors` holds two sensors of one name; give each its own.")
-    if not found:
-        raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
-    return list(found.values())
+    given = check_kind("sensors", sensors, list, tuple)
+    found = [one if isinstance(one, Sensor) else SENSORS[check_choice("sensors", one, SENSORS)] for one in given]
+    named = {sensor.name: sensor for sensor in found}
+    if len(named) != max(len(set(found)), 1):
+        raise InvalidInputError("`sensors` is empty or holds two of one name; pass some, such as ['gelsight'].")
+    return list(named.values())
 
 
-def _numbers(label: str, values: object, count: int | None = None, most: float = math.inf) -> Tensor:
+def _numbers(label: str, values: Any, count: int | None = None, most: int = 2**63 - 1) -> Tensor:
     """One part of the names of N contacts, int64 (N,), from 0 to `most`."""
-    try:
-        numbers = torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidTypeError(f"`{label}` cannot be read as integers ({first_line(error)}); pass one each.") from error
-    if numbers.is_sparse or numbers.dtype == torch.bool or not torch.can_cast(numbers.dtype, torch.int64):
-        raise InvalidTypeError(f"`{label}` is {describe(values)}; it has to hold integers.")
-    if numbers.ndim != 1 or len(numbers) != (count or max(len(numbers), 1)):
-        raise InvalidInputError(f"`{label}` is {describe(values)}; pass one for each contact, such as [3].")
-    for end in numbers.aminmax():
-        check_integer(label, int(end), 0, most)
-    return numbers.long()
+    given = values.tolist() if hasattr(values, "tolist") else values
+    if not isinstance(given, Sequence) or len(given) != (count or max(len(given), 1)):
+        raise InvalidInputError(f"`{label}` is {describe(values)}; pass an integer for each contact, such as [3].")
+    return torch.tensor([check_integer(label, number, 0, most) for number in given])
