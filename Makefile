@@ -11,8 +11,7 @@ ARGS ?=
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
-STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier \
-	language_model touch_llm
+STAGES := image_text audio touch image_vae unclip touch_vae touch_ldm language_model touch_llm
 JOINT := --joint $(RUNS)/image_text/model
 # Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
 MODULE_captions := image_text

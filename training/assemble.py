@@ -90,7 +90,7 @@ def assemble(
         UniTouchProcessor.from_pretrained(models["image_text"]).save_pretrained(place / "joint")
         parts = [models[stage] / "model.safetensors" for stage in ("image_text", "audio", "touch")]
         halved(parts, place / "joint" / "model.safetensors")
-        for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
+        for stage in ("image_vae", "touch_vae"):
             half_folder(models[stage], place / stage.replace("_", "-"))
         # Of diffusers' multistep schedulers and spacings, these do best in the number of steps above.
         pictures = (TOUCH_TO_IMAGE, DEISMultistepScheduler, "use_karras_sigmas")

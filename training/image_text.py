@@ -23,15 +23,19 @@ from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
-from unitouch_gen.training.recipe import Arguments, build
+from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.world import ATTRIBUTES
+
+SHOWN = tuple(name for name in ATTRIBUTES if name not in ("depth", "load"))
+"""Attributes that a picture shows: how hard a sensor is pressed leaves no trace in it."""
 
 
-class ImageTextSettings(AttributeSettings):
+class ImageTextSettings(Settings):
     """What drawn contacts add to CLIP."""
 
+    attributes: NonNegativeFloat = 0.0  # weight of the squared error of attributes, in units of their deviations
     captions: PositiveInt = 1  # of each drawn contact, one of which is drawn at every step
     views: NonNegativeFloat = 0.0  # weight of InfoNCE between pictures of a contact under two lamps
 
@@ -53,7 +57,7 @@ class ImageTextObjective(nn.Module):
         super().__init__()
         self.model, self.settings = model, settings
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / model.config.temperature)))
-        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if settings.attributes else None
+        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN)) if settings.attributes else None
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = batches.shift_pixels(batch["image"].float() / 255, 4)
@@ -100,7 +104,9 @@ def main(stage: Stage) -> None:
 
     data: dict[str, Any] = {"image": [split.image for split in splits]}
     if objective.attributes:
-        data["attributes"] = in_deviations(np.asarray(columns(splits, "image", SHOWN["image"]).columns["attributes"]))
+        chosen = [ATTRIBUTES.index(name) for name in SHOWN]
+        measured = [np.asarray(split.attributes)[:, :, chosen].mean(axis=1) for split in splits]  # by both sensors
+        data["attributes"] = in_deviations(np.concatenate(measured))
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.views:
         pairs = zip(stage.sources, splits, strict=True)

@@ -1,4 +1,4 @@
-"""Stage 4, the autoencoder of pictures, and the objective that stage 7, of touches, shares.
+"""Stage 4, the autoencoder of pictures, and the objective that stage 6, of touches, shares.
 
     python -m unitouch_gen.training.image_vae --output runs/image_vae
 

@@ -39,10 +39,8 @@ STAGES: dict[str, dict[str, str]] = {
     "touch": {"joint": "image_text"},
     "image_vae": {},
     "unclip": {"joint": "image_text", "vae": "image_vae"},
-    "picture_classifier": {},
     "touch_vae": {},
     "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
-    "touch_classifier": {},
     "language_model": {"joint": "image_text"},
     "touch_llm": {"joint": "image_text", "llama": "language_model"},
 }

@@ -1,4 +1,4 @@
-"""Stage 8, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
+"""Stage 7, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
 
     python -m unitouch_gen.training.touch_ldm --joint runs/image_text/model --vae runs/touch_vae/model \
         --output runs/touch_ldm

@@ -1,4 +1,4 @@
-"""Stage 7, the autoencoder of touch images.
+"""Stage 6, the autoencoder of touch images.
 
 python -m unitouch_gen.training.touch_vae --output runs/touch_vae
 """

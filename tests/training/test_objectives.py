@@ -21,9 +21,8 @@ from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of, sensor_numbers
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
-from unitouch_gen.training.picture_classifier import SHOWN, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
-from unitouch_gen.world import ATTRIBUTES, untouched_gel
+from unitouch_gen.world import untouched_gel
 
 COUNT, NORM = 600, 14.0
 SCHEDULER = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
@@ -133,16 +132,6 @@ def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of
     with torch.no_grad():
         next(vae.encoder.parameters()).mul_(1.5)
     assert not torch.allclose(image_vae.cached_latents(vae, [PICTURES], "k", tmp_path), latents / 2)
-
-
-def test_touches_of_both_sensors_have_their_own_attributes_and_pictures_the_mean(split: Rendered) -> None:
-    count, truth = len(split), np.asarray(split.attributes)
-    batch = columns([split], "touch", ATTRIBUTES)[range(2 * count)]
-    np.testing.assert_array_equal(batch["pixels"], np.concatenate([split.touch, split.second]))
-    np.testing.assert_array_equal(batch["attributes"], np.concatenate([truth[:, 0], truth[:, 1]]))
-    found = columns([split], "image", ("cover", "compliance"))[range(count)]["attributes"]
-    np.testing.assert_allclose(found, truth[:, :, [0, -1]].mean(axis=1), rtol=1e-6)
-    assert {*ATTRIBUTES} - {*SHOWN["image"]} == {"depth", "load"}
 
 
 class Shown(nn.Module):

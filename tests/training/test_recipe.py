@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
-from transformers import ResNetConfig
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
@@ -15,7 +14,6 @@ from unitouch_gen.training.distill import DistillRecipe
 from unitouch_gen.training.image_text import ImageTextRecipe
 from unitouch_gen.training.image_vae import AutoencoderRecipe, make_autoencoder
 from unitouch_gen.training.language_model import LanguageModelRecipe
-from unitouch_gen.training.picture_classifier import ClassifierRecipe
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe
 from unitouch_gen.training.tokenizer import train_tokenizer
@@ -26,8 +24,7 @@ from unitouch_gen.training.unclip import UnclipRecipe
 
 KINDS: dict[str, type[Recipe]] = {
     "image_text": ImageTextRecipe, "audio": Recipe, "touch": TouchRecipe, "image_vae": AutoencoderRecipe,
-    "unclip": UnclipRecipe, "picture_classifier": ClassifierRecipe, "touch_vae": AutoencoderRecipe,
-    "touch_ldm": TouchDiffusionRecipe, "touch_classifier": ClassifierRecipe,
+    "unclip": UnclipRecipe, "touch_vae": AutoencoderRecipe, "touch_ldm": TouchDiffusionRecipe,
     "language_model": LanguageModelRecipe, "touch_llm": TouchLLMRecipe, "distill": DistillRecipe,
 }  # fmt: skip
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
@@ -47,8 +44,6 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
             assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 4)  # as the paper's
         elif "vae" in name and "paper" in name:
             make_autoencoder(recipe.model)
-        elif "classifier" in name:
-            build("model", ResNetConfig, recipe.model)
         elif hasattr(recipe, "scheduler"):
             build("model", UNet2DConditionModel, recipe.model)
     if hasattr(recipe, "scheduler"):

@@ -19,15 +19,13 @@ from tests.helpers.components import AUDIO, SPACE
 from tests.training.test_recipe import KINDS
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.assemble import assemble
-from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import STAGES, Stage, command_of, run, weights_of
 from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
-from unitouch_gen.world import MATERIAL_NAMES, World
+from unitouch_gen.world import World
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHORT = (
@@ -40,7 +38,6 @@ ALONE = ("data.image_size=32", f"data.audio={json.dumps(AUDIO)}")
 VAE = tuple(f"model.{part}_block_out_channels=[8, 8, 8, 8]" for part in ("encoder", "decoder"))
 UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.attention_head_dim=1",
         "model.cross_attention_dim=16")  # fmt: skip
-RESNET = ("model.embedding_size=8", "model.hidden_sizes=[8]", "model.depths=[1]")
 SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 SETTINGS: dict[str, tuple[str, ...]] = {
     "image_text": (*ALONE, *SPACED, "tokenizer.vocab_size=600", "objective.views=1.0", "sampler.sigma=0.75",
@@ -49,10 +46,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),
     "unclip": (*UNET, "model.projection_class_embeddings_input_dim=32"),
-    "picture_classifier": (*ALONE, *RESNET),
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
-    "touch_classifier": (*ALONE, *RESNET),
     "language_model": ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("model.intermediate_size=24",),
 }  # fmt: skip
@@ -91,10 +86,6 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         still = {key for key, value in last.items() if torch.equal(value, first[key])}
         if name not in ("unclip", "touch_ldm"):  # group norms of single pixels learn nothing
             assert {key.split(".")[0] for key in still if not key.endswith(("known", "prototypes"))} <= FROZEN[name]
-    for name, modality in (("picture_classifier", "image"), ("touch_classifier", "touch")):
-        classifier = ContactClassifier.from_pretrained(runs / name / "model")
-        assert classifier.attributes == SHOWN[modality]
-        assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
 @pytest.mark.parametrize("name", ["touch", "unclip", "language_model", "touch_llm"])
@@ -153,9 +144,9 @@ def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path,
     for path in family.rglob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             kinds[path] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
-    # the joint space; of pictures and of touches autoencoder, UNet and classifier; normaliser, bank, and
-    # untouched gels; language model and bridge
-    assert len(kinds) == 12 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
+    # the joint space; of pictures and of touches autoencoder and UNet; normaliser, bank, and untouched gels; language
+    # model and bridge
+    assert len(kinds) == 10 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
     for part in ("image_text", "audio", "touch"):
         state = load_file(runs / part / "model" / "model.safetensors")
         stored = load_file(family / "joint" / "model.safetensors")
