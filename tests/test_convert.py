@@ -17,12 +17,12 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
 
+from tests.helpers.components import clip_tokenizer
 from tests.helpers.imagebind import ImageBind
 from tests.helpers.published import features_of, inputs_of, published, sizes
 from unitouch_gen.convert import convert_published, open_checkpoint, read_published
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.tokenizer import train_tokenizer
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, suffix):
 # The folder -----------------------------------------------------------------------------------------------------------
 
 
-TOKENIZER = train_tokenizer(["rough brick", "a photo of glass"], 600, 77)
+TOKENIZER = clip_tokenizer(77)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,8 @@
 Pictures of a drawn contact under two lamps can be bound to each other, as SimCLR binds views of an image (Chen et al.,
 2020). Captions do not say which contact a picture shows, and touches are bound to single pictures later.
 
-`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's.
+`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's and of
+the built-in tokenizer, which knows the world's words and every byte.
 
 python -m unitouch_gen.training.image_text --output runs/image_text
 """
@@ -19,13 +20,14 @@ from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
-from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.weights import JOINT
 from unitouch_gen.world import ATTRIBUTES
 
 SHOWN = tuple(name for name in ATTRIBUTES if name not in ("depth", "load"))
@@ -41,7 +43,6 @@ class ImageTextSettings(Settings):
 
 
 class ImageTextRecipe(Recipe):
-    tokenizer: Arguments
     model: Arguments
     objective: ImageTextSettings = ImageTextSettings()
     sampler: SamplerSettings = SamplerSettings()  # alike to the weights that training starts from
@@ -89,7 +90,6 @@ def recoloured(pictures: Tensor) -> Tensor:
 def main(stage: Stage) -> None:
     recipe: ImageTextRecipe = stage.recipe
     init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
-    build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
     captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
@@ -97,7 +97,7 @@ def main(stage: Stage) -> None:
     if init is not None:
         model = UniTouchModel.from_pretrained(init, modalities=("image", "text"), dtype=torch.float32)
     else:
-        processor.tokenizer = tokenizer = build("tokenizer", train_tokenizer, recipe.tokenizer, texts=texts)
+        processor.tokenizer = tokenizer = read_tokenizer("tokenizer", JOINT)
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
         config.text_config.update({"vocab_size": len(tokenizer), **special})  # type: ignore[union-attr]
         model = UniTouchModel(config, modalities=("image", "text"))

@@ -40,15 +40,14 @@ UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.a
         "model.cross_attention_dim=16")  # fmt: skip
 SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 SETTINGS: dict[str, tuple[str, ...]] = {
-    "image_text": (*ALONE, *SPACED, "tokenizer.vocab_size=600", "objective.views=1.0", "sampler.sigma=0.75",
-                   "sampler.group=2"),
+    "image_text": (*ALONE, *SPACED, "objective.views=1.0", "sampler.sigma=0.75", "sampler.group=2"),
     "audio": (),
     "touch": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),
     "unclip": (*UNET, "model.projection_class_embeddings_input_dim=32"),
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
-    "language_model": ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24"),
+    "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("model.intermediate_size=24",),
 }  # fmt: skip
 FROZEN = defaultdict(set, touch_llm={"language_model"})
