@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.stages import Recipe, Stage, run
 
 
 class AudioObjective(nn.Module):
@@ -40,7 +40,8 @@ def main(stage: Stage) -> None:
     model.add("audio")
     stage.fit(AudioObjective(model), dataset)
     with stage.saving() as folder:
-        save_modalities(model, ("audio",), stage.processor, folder)
+        model.save_pretrained(folder)
+        stage.processor.save_pretrained(folder)
 
 
 if __name__ == "__main__":

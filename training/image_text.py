@@ -26,7 +26,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, 
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Arguments, Settings, build
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.weights import JOINT
 from unitouch_gen.world import ATTRIBUTES
 
@@ -95,7 +95,12 @@ def main(stage: Stage) -> None:
     captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
     texts = [caption for one in captions for caption in one]
     if init is not None:
-        model = UniTouchModel.from_pretrained(init, modalities=("image", "text"), dtype=torch.float32)
+        begun = UniTouchModel.from_pretrained(init, modalities=("image", "text"))
+        begun.config.ood_thresholds, begun.config.sensor_reaches = {}, {}
+        # Its touch and audio are bound to what its pictures were.
+        model = UniTouchModel(begun.config, modalities=())  # type: ignore[arg-type]
+        for modality in ("image", "text"):
+            model.load_tensors(modality, begun.state_dict())
     else:
         processor.tokenizer = tokenizer = read_tokenizer("tokenizer", JOINT)
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
@@ -120,7 +125,8 @@ def main(stage: Stage) -> None:
     embeddings = stage.image_embeddings(model, splits).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings, axis=1).mean())
     with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
-        save_modalities(model, ("image", "text"), processor, folder)
+        model.save_pretrained(folder)
+        processor.save_pretrained(folder)
 
 
 if __name__ == "__main__":

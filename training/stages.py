@@ -5,7 +5,6 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from datetime import timedelta
 from functools import cached_property, partial
 from inspect import signature
@@ -19,7 +18,6 @@ import typer
 from accelerate import PartialState
 from accelerate.utils import parse_flag_from_env
 from diffusers import UNet2DConditionModel
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from typer import Option
 
@@ -27,7 +25,6 @@ from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
@@ -36,7 +33,7 @@ from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 STAGES: dict[str, dict[str, str]] = {
     "image_text": {},
     "audio": {"joint": "image_text"},
-    "touch": {"joint": "image_text"},
+    "touch": {"joint": "audio"},
     "image_vae": {},
     "unclip": {"joint": "image_text", "vae": "image_vae"},
     "touch_vae": {},
@@ -215,22 +212,6 @@ def weights_of(folder: Path) -> str:
         with file.open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
-
-
-def save_modalities(
-    model: UniTouchModel, modalities: Sequence[str], processor: UniTouchProcessor, folder: Path
-) -> None:
-    """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
-    config, names = deepcopy(model.config), [name for modality in modalities for name in MODULES[modality]]
-    if "touch" in modalities:
-        names.append("out_of_distribution")
-    else:
-        config.ood_thresholds, config.sensor_reaches = {}, {}  # of other weights
-    config.save_pretrained(folder)
-    processor.save_pretrained(folder)
-    kept = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] in names}
-    state = {key: value.contiguous().clone() for key, value in kept.items()}
-    save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
 
 
 def run_stage(name: str, kind: type[Recipe], main: Callable[[Stage], None], **options: Any) -> None:

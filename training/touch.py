@@ -1,6 +1,6 @@
 """Stage 3, touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
 
-python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
+python -m unitouch_gen.training.touch --joint runs/audio/model --output runs/touch
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, 
 from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
 
@@ -204,7 +204,8 @@ def main(stage: Stage) -> None:
     stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
     fit_distance(model, splits)
     with stage.saving() as folder:
-        save_modalities(model, ("touch",), stage.processor, folder)
+        model.save_pretrained(folder)
+        stage.processor.save_pretrained(folder)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a joint space and a family are worth on the world and on real touches, each figure beside its controls.
 
-    python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model -o quality.json
+    python -m tests.benchmarks.quality --joint runs/touch/model -o quality.json
         the joint space alone: sensors that nobody has seen, objects held out
     python -m tests.benchmarks.quality --family runs/family --touched-by gelsight --photos FOLDER
         and what its pipelines make of a GelSight's touches, by the built-in classifiers; photos are restyled, too
