@@ -7,8 +7,7 @@ import torch
 from scipy.spatial.distance import mahalanobis
 
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.training.abstention import fit_distance, fit_gaussians
-from unitouch_gen.training.touch import set_prototypes
+from unitouch_gen.training.touch import fit_distance, fit_gaussians, set_prototypes
 
 
 def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(model, processor, split, tmp_path):
