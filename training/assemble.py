@@ -1,6 +1,6 @@
 """The last stage: puts the outputs of the others together into one family of weights, in fp16.
 
-python -m unitouch_gen.training.assemble --runs runs --output my-family
+python -m unitouch_gen.training assemble --runs runs --output my-family
 """
 
 import json
@@ -16,7 +16,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import writing_folder
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.language_model import PROMPT
-from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
+from unitouch_gen.training.stages import STAGES, command_of, weights_of
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
@@ -98,7 +98,3 @@ def assemble(
             scheduler.save_pretrained(place / name / "scheduler")
         halve(place)
         write_json({"training": records, "figures": {}}, place / "family.json")
-
-
-if __name__ == "__main__":
-    run_command("assemble", assemble)

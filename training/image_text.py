@@ -6,7 +6,7 @@ Pictures of a drawn contact under two lamps can be bound to each other, as SimCL
 `--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's and of
 the built-in tokenizer, which knows the world's words and every byte.
 
-python -m unitouch_gen.training.image_text --output runs/image_text
+python -m unitouch_gen.training image_text --output runs/image_text
 """
 
 import math
@@ -26,7 +26,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, 
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Arguments, Settings, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.weights import JOINT
 from unitouch_gen.world import ATTRIBUTES
 
@@ -87,8 +87,7 @@ def recoloured(pictures: Tensor) -> Tensor:
     return batches.add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
 
 
-def main(stage: Stage) -> None:
-    recipe: ImageTextRecipe = stage.recipe
+def main(stage: Stage, recipe: ImageTextRecipe) -> None:
     init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
@@ -127,7 +126,3 @@ def main(stage: Stage) -> None:
     with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
         model.save_pretrained(folder)
         processor.save_pretrained(folder)
-
-
-if __name__ == "__main__":
-    run("image_text", ImageTextRecipe, main)

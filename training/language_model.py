@@ -3,7 +3,7 @@
 It is so small, and reads so little, that a bridge into one that was trained on words alone hardly moves it. So it is
 trained with a bridge from pictures' embeddings, which is left: `touch_llm` trains another, with the model frozen.
 
-python -m unitouch_gen.training.language_model --joint runs/image_text/model --output runs/language_model
+python -m unitouch_gen.training language_model --joint runs/image_text/model --output runs/language_model
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.weights import TOUCH_TO_TEXT
 from unitouch_gen.world import World
 from unitouch_gen.world.questions import TOPICS, answered
@@ -96,8 +96,7 @@ def encoded(tokenizer: PreTrainedTokenizerBase, pairs: Sequence[Pairs]) -> dict[
     return {name: column.view(len(pairs), -1, ids.shape[1]) for name, column in columns.items()}
 
 
-def main(stage: Stage) -> None:
-    recipe: LanguageModelRecipe = stage.recipe
+def main(stage: Stage, recipe: LanguageModelRecipe) -> None:
     joint, splits = stage.joint_space("image"), stage.splits("image", "text")
     pairs = pairs_of(stage.sources, splits)
     tokenizer = AutoTokenizer.from_pretrained(TOUCH_TO_TEXT / "language_model")  # knows every byte
@@ -115,7 +114,3 @@ def main(stage: Stage) -> None:
 def build_bridge(section: str, arguments: Arguments, language_model: LlamaForCausalLM, joint: UniTouchModel) -> Any:
     given = {"language_model": language_model, "embedding_dim": joint.config.projection_dim}
     return build(section, LanguageBridge.for_model, arguments, **given)
-
-
-if __name__ == "__main__":
-    run("language_model", LanguageModelRecipe, main)

@@ -2,7 +2,7 @@
 
 At its end it fits the distance that tells which touches are unlike those the encoder was trained on.
 
-python -m unitouch_gen.training.touch --joint runs/audio/model --output runs/touch
+python -m unitouch_gen.training touch --joint runs/audio/model --output runs/touch
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, 
 from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
 ABSTAINED = 0.046  # share of the touches of training that are beyond the threshold
@@ -224,8 +224,7 @@ def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
     }
 
 
-def main(stage: Stage) -> None:
-    recipe: TouchRecipe = stage.recipe
+def main(stage: Stage, recipe: TouchRecipe) -> None:
     stage.check_drawn(*recipe.objective.pairs)
     share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     model = stage.joint_space("image")
@@ -251,7 +250,3 @@ def main(stage: Stage) -> None:
     with stage.saving() as folder:
         model.save_pretrained(folder)
         stage.processor.save_pretrained(folder)
-
-
-if __name__ == "__main__":
-    run("touch", TouchRecipe, main)

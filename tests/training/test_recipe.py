@@ -1,6 +1,7 @@
 """Recipes: every one in the folder is understood, overrides are laid over them, and what is wrong is named."""
 
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,27 +11,17 @@ from diffusers import DDPMScheduler, UNet2DConditionModel
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
-from unitouch_gen.training.distill import DistillRecipe
-from unitouch_gen.training.image_text import ImageTextRecipe
-from unitouch_gen.training.image_vae import AutoencoderRecipe, make_autoencoder
-from unitouch_gen.training.language_model import LanguageModelRecipe
+from unitouch_gen.training.image_vae import make_autoencoder
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
-from unitouch_gen.training.stages import Recipe
-from unitouch_gen.training.touch import TouchRecipe
-from unitouch_gen.training.touch_ldm import TouchDiffusionRecipe
-from unitouch_gen.training.touch_llm import TouchLLMRecipe
-from unitouch_gen.training.unclip import UnclipRecipe
+from unitouch_gen.training.stages import MODULES, Recipe
 
-KINDS: dict[str, type[Recipe]] = {
-    "image_text": ImageTextRecipe, "audio": Recipe, "touch": TouchRecipe, "image_vae": AutoencoderRecipe,
-    "unclip": UnclipRecipe, "touch_vae": AutoencoderRecipe, "touch_ldm": TouchDiffusionRecipe,
-    "language_model": LanguageModelRecipe, "touch_llm": TouchLLMRecipe, "distill": DistillRecipe,
-}  # fmt: skip
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
 
 
 def read_as(name: str, *overrides: str) -> Any:
-    return read(KINDS[re.sub("_(paper|pairs|lamps)$", "", name)], read_recipe(name, overrides))
+    stage = re.sub("_(paper|pairs|lamps)$", "", name)
+    main = import_module(f"unitouch_gen.training.{MODULES.get(stage, stage)}").main
+    return read(main.__annotations__["recipe"], read_recipe(name, overrides))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 from collections import defaultdict
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,14 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from tests.helpers.components import AUDIO, SPACE
-from tests.training.test_recipe import KINDS
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.assemble import assemble
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import STAGES, Stage, command_of, run, weights_of
+from unitouch_gen.training.stages import STAGES, Stage, command_of, weights_of
+from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import World
@@ -59,9 +59,8 @@ def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None
     given = [word for option, before in STAGES[name].items() for word in (f"--{option}", str(runs / before / "model"))]
     overrides = [word for setting in (*SHORT, *SETTINGS[name]) for word in ("--set", setting)]
     places = ["--output", str(runs / (output or name)), "--cache", str(runs / "cache")]
-    main = import_module(f"unitouch_gen.training.{name}").main
     AcceleratorState._reset_state()  # as a process of its own would find it
-    run(name, KINDS[name], main, [*given, *overrides, *places, *words])
+    run_commands(app, "unitouch_gen.training", [name, *given, *overrides, *places, *words])
 
 
 @pytest.fixture(scope="module")
@@ -173,12 +172,12 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
     place.mkdir(parents=True)
     (place / "progress.json").write_text(json.dumps({"step": 1, "seconds": 1.0, "recipe": recipe, "inputs": inputs}))
     given = {"joint": Path(joint), "output": tmp_path, "resume": True}
-    found = Stage("touch", KINDS["touch"], overrides=["trainer.steps=3"], **given)
+    found = Stage("touch", TouchRecipe, overrides=["trainer.steps=3"], **given)
     assert (found.recipe.sampler.sigma, found.trainer.steps) == (0.5, 3)
     file = next(Path(joint).rglob("*.safetensors"))
     save_file({"weight": torch.ones(2)}, file)
     with pytest.raises(InvalidInputError, match=r"was built on other weights than --joint"):
-        Stage("touch", KINDS["touch"], **given)
+        Stage("touch", TouchRecipe, **given)
 
 
 def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, vae, monkeypatch, capsys, tmp_path):
@@ -189,7 +188,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
-        ("touch", "", "touch needs folders of models: python -m unitouch_gen.training.touch --joint"),
+        ("touch", "", "touch needs folders of models: python -m unitouch_gen.training touch --joint"),
         ("audio", "--joint nowhere", "'nowhere' does not exist"),
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
@@ -198,9 +197,9 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
     ):
-        main = import_module(f"unitouch_gen.training.{name}").main
+        given = words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split()
         with pytest.raises(SystemExit, match="2"):
-            run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
+            run_commands(app, "unitouch_gen.training", [name, *given])
         (error,) = capsys.readouterr().err.splitlines()
         assert message in error and list((tmp_path / "here").iterdir()) == []
 
@@ -210,7 +209,7 @@ def commands(runs: Path) -> list[str]:
     words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
     lines = done.stdout.replace("\\\n", " ").splitlines()
-    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training." in line]
+    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line]
     return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
 
 
@@ -219,8 +218,8 @@ def expected(stage: str, runs: Path) -> list[str]:
     whole = command_of(stage, runs)
     if stage == "image_text":
         captions, output = runs / "captions", whole.split(" --output ")[1]
-        first = f"python -m unitouch_gen.training.image_text --output {captions}"
-        begun = f"python -m unitouch_gen.training.image_text --recipe image_text_lamps --init {captions / 'model'}"
+        first = f"python -m unitouch_gen.training image_text --output {captions}"
+        begun = f"python -m unitouch_gen.training image_text --recipe image_text_lamps --init {captions / 'model'}"
         return [first, f"{begun} --output {output}"]
     if stage != "touch":
         return [whole]
@@ -234,5 +233,5 @@ def expected(stage: str, runs: Path) -> list[str]:
 )
 def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
-    last = f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}"
+    last = f"python -m unitouch_gen.training assemble --runs {tmp_path} --output {family}"
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]

@@ -1,7 +1,6 @@
 """Data sets as the columns that stages are trained on: decoded once, refused where they are broken, mixed, split."""
 
 import json
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,11 @@ import torch
 from PIL import Image
 
 from tests.helpers.data_sets import RED, write_image
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings, open_dataset
-from unitouch_gen.training.stages import run
 
 
 @pytest.fixture
@@ -129,8 +128,8 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
                 f"data.sets=[{{path: {folder}, split: object}}]",
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
     words = ["--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
-    module = import_module("unitouch_gen.training.touch")
-    run("touch", module.TouchRecipe, module.main, [*words, *(part for one in settings for part in ("--set", one))])
+    overrides = [part for one in settings for part in ("--set", one)]
+    run_commands(app, "unitouch_gen.training", ["touch", *words, *overrides])
     assert json.loads((tmp_path / "touch" / "record.json").read_text())["sets"] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))
