@@ -69,13 +69,9 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
     """Material by zero-shot, contacts told from others of their material, and what is read linearly off touches."""
     material, truth, rows = contacts.material, contacts.attributes, {}
     size = min(AMONG, int(torch.bincount(material).min()))
-    embeds = {
-        name: joint.features(name, getattr(contacts, name))
-        for name in ("touch", "image", "audio", "text")
-        if name in joint.models
-    }
+    embeds = {name: joint.features(name, getattr(contacts, name)) for name in joint.model.known_modalities}
     real: Any = touch_classifier.observe(float_pixels(contacts.touch))
-    if "text" in joint.models:
+    if "text" in embeds:
         for name, features in embeds.items():
             found = material_rows(joint, name, features, material)
             if name == "touch":
@@ -244,8 +240,8 @@ def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, se
 
 def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     """Probes of real touches, beside plain statistics, the untouched gel and untrained encoders."""
-    spaces = {"touch encoder": joint.models["touch"]}
-    spaces |= {f"untrained {seed}": untrained_like(joint.models["touch"], seed) for seed in range(UNTRAINED)}
+    spaces = {"touch encoder": joint.model}
+    spaces |= {f"untrained {seed}": untrained_like(joint.model, seed) for seed in range(UNTRAINED)}
     size, figures = joint.processor.image_size, {}
 
     def embedded(pixels: np.ndarray) -> dict[str, np.ndarray]:
@@ -277,7 +273,7 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
 @torch.no_grad()
 def abstained(joint: JointSpace, touches: np.ndarray) -> dict[str, float]:
     """Shares of uint8 touches (N, 3, S, S) that are called untouched, and unlike anything known."""
-    model, reasons = joint.models["touch"], list[str | None]()
+    model, reasons = joint.model, list[str | None]()
     for part in torch.from_numpy(touches).split(256):
         reasons += model.encode_touches(normalise_pixels(part.float() / 255))[1]
     return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
@@ -303,7 +299,7 @@ TURBO_ROWS: dict[str, tuple[Callable[..., Figures], str]] = {
 
 def measure(given: argparse.Namespace, cache: Path) -> Figures:
     """All that can be measured of what was given."""
-    joint = JointSpace.from_folders(given.joint)
+    joint = JointSpace.from_folder(given.joint)
     folders = {"image": given.picture_classifier, "touch": given.touch_classifier}
     judges = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
     pipes = {name: quiet(name, family=given.family) for name in given.pipelines if given.family}
@@ -351,7 +347,7 @@ def quality_figures(recordings: Path | None, photos: Path | None, seeds: int) ->
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.quality")
-    parser.add_argument("--joint", nargs="+", type=Path, help="folders of the joint space; the family's if left out")
+    parser.add_argument("--joint", type=Path, help="folder of the joint space; the family's if left out")
     parser.add_argument("--family", type=Path, help="folder with the layout of the built-in one: what it makes")
     parser.add_argument("--picture-classifier", type=Path, default=weights.PICTURE_CLASSIFIER, help="folder")
     parser.add_argument("--touch-classifier", type=Path, default=weights.TOUCH_CLASSIFIER, help="folder")
@@ -373,7 +369,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("name `--joint` or `--family`.")
     distilled = [name for name, of in TURBO.items() if given.family and (given.family / of / "turbo").is_dir()]
     given.pipelines = given.pipelines or [*PIPELINES, *distilled]
-    given.joint = given.joint or [given.family / weights.JOINT.name]
+    given.joint = given.joint or given.family / weights.JOINT.name
     return given
 
 

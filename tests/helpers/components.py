@@ -39,10 +39,10 @@ LLAMA = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "nu
          "max_position_embeddings": 64, "tie_word_embeddings": True}  # fmt: skip
 
 
-def clip_tokenizer(length: int = 12) -> CLIPTokenizer:
-    """The built-in one, which cuts and pads texts to so many tokens."""
+def clip_tokenizer() -> CLIPTokenizer:
+    """The built-in one, which cuts and pads texts to twelve tokens."""
     tokenizer = read_tokenizer("tokenizer", weights.JOINT)
-    tokenizer.model_max_length = length
+    tokenizer.model_max_length = 12
     return tokenizer
 
 

@@ -108,11 +108,10 @@ def test_a_recipe_that_is_none_is_refused(tmp_path: Path) -> None:
 
 
 def test_what_a_library_refuses_is_one_line() -> None:
-    cases: list[tuple[Any, dict, str]] = [
-        (UNet2DConditionModel, {"smaple_size": 3}, "In `model`, `smaple_size` is unknown.*mean 'sample_size'"),
-        (UNet2DConditionModel, {"block_out_channels": [8]}, "`model` cannot be used: .*block_out_channels"),
-    ]
-    for kind, arguments, message in cases:
+    for arguments, message in (
+        ({"smaple_size": 3}, "In `model`, `smaple_size` is unknown.*mean 'sample_size'"),
+        ({"block_out_channels": [8]}, "`model` cannot be used: .*block_out_channels"),
+    ):
         with pytest.raises(InvalidInputError, match=message) as raised:
-            build("model", kind, arguments)
+            build("model", UNet2DConditionModel, arguments)
         assert "\n" not in str(raised.value)

@@ -216,16 +216,12 @@ def commands(runs: Path) -> list[str]:
 def expected(stage: str, runs: Path) -> list[str]:
     """Commands of a stage; pictures begin from captions alone, and touch from what it learns without pictures."""
     whole = command_of(stage, runs)
-    if stage == "image_text":
-        captions, output = runs / "captions", whole.split(" --output ")[1]
-        first = f"python -m unitouch_gen.training image_text --output {captions}"
-        begun = f"python -m unitouch_gen.training image_text --recipe image_text_lamps --init {captions / 'model'}"
-        return [first, f"{begun} --output {output}"]
-    if stage != "touch":
+    if stage not in ("image_text", "touch"):
         return [whole]
     start, output = whole.split(" --output ")
-    pairs = f"{start} --recipe touch_pairs --output {runs / 'touch_pairs'}"
-    return [pairs, f"{start} --init {runs / 'touch_pairs' / 'model'} --output {output}"]
+    before = runs / ("touch_pairs" if stage == "touch" else "captions")
+    pairs, lamps = (" --recipe touch_pairs", "") if stage == "touch" else ("", " --recipe image_text_lamps")
+    return [f"{start}{pairs} --output {before}", f"{start}{lamps} --init {before / 'model'} --output {output}"]
 
 
 @pytest.mark.skipif(

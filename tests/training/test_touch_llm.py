@@ -1,16 +1,15 @@
 """What Touch-LLM's two stages are trained on: questions about the world, and their answers."""
 
 import torch
-from transformers import AutoTokenizer
 
+from tests.helpers.components import make_language_parts
 from unitouch_gen.training import language_model
-from unitouch_gen.weights import TOUCH_TO_TEXT
 from unitouch_gen.world import ATTRIBUTES, MATERIALS, World
 from unitouch_gen.world.questions import TOPICS, answered
 
 
 def test_labels_are_the_answers_and_their_end(processor) -> None:
-    tokenizer = AutoTokenizer.from_pretrained(TOUCH_TO_TEXT / "language_model")
+    tokenizer = make_language_parts()["tokenizer"]
     pairs = language_model.encoded(tokenizer, [[("How is it?", "rough."), ("ä?", "é")]])
     for row, (prompt, answer) in enumerate((("How is it?\n", "rough."), ("ä?\n", "é"))):
         ids, labels = pairs["input_ids"][0, row], pairs["labels"][0, row]

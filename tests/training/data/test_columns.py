@@ -127,9 +127,8 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
     settings = ["trainer.steps=2", "trainer.batch_size=4", "trainer.warmup=1", "trainer.mixed_precision=no",
                 f"data.sets=[{{path: {folder}, split: object}}]",
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
-    words = ["--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
-    overrides = [part for one in settings for part in ("--set", one)]
-    run_commands(app, "unitouch_gen.training", ["touch", *words, *overrides])
+    words = ["touch", "--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
+    run_commands(app, "unitouch_gen.training", [*words, *(part for one in settings for part in ("--set", one))])
     assert json.loads((tmp_path / "touch" / "record.json").read_text())["sets"] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))
