@@ -11,16 +11,16 @@ ARGS ?=
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
-STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier \
-	language_model touch_llm
+STAGES := image_text audio touch image_vae unclip touch_vae touch_ldm language_model touch_llm
 JOINT := --joint $(RUNS)/image_text/model
+SOUNDED := --joint $(RUNS)/audio/model
 # Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
-MODULE_captions := image_text
-MODULE_touch_pairs := touch
-TAKES_touch_pairs := $(JOINT) --recipe touch_pairs
+STAGE_captions := image_text
+STAGE_touch_pairs := touch
+TAKES_touch_pairs := $(SOUNDED) --recipe touch_pairs
 TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
 TAKES_audio := $(JOINT)
-TAKES_touch := $(JOINT) --init $(RUNS)/touch_pairs/model
+TAKES_touch := $(SOUNDED) --init $(RUNS)/touch_pairs/model
 TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
 TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
 TAKES_language_model := $(JOINT)
@@ -64,17 +64,18 @@ bench: $(VENV)/.installed  ## measure and print every figure that the README and
 	$(BIN)/python -m tests.benchmarks $(ARGS)
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
-	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
+	$(BIN)/python -m unitouch_gen.training assemble --runs $(RUNS) --output $(FAMILY)
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
 RECORDS := $(patsubst %,$(RUNS)/%/record.json,$(STAGES) captions touch_pairs)
 $(RECORDS): $(RUNS)/%/record.json: | $(VENV)/.installed
-	$(BIN)/python -m unitouch_gen.training.$(or $(MODULE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
+	$(BIN)/python -m unitouch_gen.training $(or $(STAGE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
-$(foreach stage,audio touch_pairs touch unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(foreach stage,audio unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
 $(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
+$(RUNS)/touch_pairs/record.json: | $(RUNS)/audio/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json

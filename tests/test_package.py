@@ -18,6 +18,7 @@ from markdown_it import MarkdownIt
 import unitouch_gen
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.examples import example, examples
+from unitouch_gen.training.stages import STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.wheel
@@ -121,7 +122,8 @@ def test_the_command_line_answers(tmp_path):
 
 
 def test_training_runs_as_a_module(tmp_path):
-    assert "usage" in run(["-m", "unitouch_gen.training.touch", "--help"], tmp_path).lower()
+    helped = run(["-m", "unitouch_gen.training", "--help"], tmp_path)
+    assert all(f" {stage} " in helped for stage in (*STAGES, "assemble"))
 
 
 def test_built_in_pipelines_run():

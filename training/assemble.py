@@ -1,6 +1,6 @@
 """The last stage: puts the outputs of the others together into one family of weights, in fp16.
 
-python -m unitouch_gen.training.assemble --runs runs --output my-family
+python -m unitouch_gen.training assemble --runs runs --output my-family
 """
 
 import json
@@ -14,10 +14,9 @@ from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import writing_folder
-from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.language_model import PROMPT
-from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
+from unitouch_gen.training.stages import STAGES, command_of, weights_of
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
@@ -25,37 +24,32 @@ TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "defau
                   "default_noise_level": 150}  # fmt: skip
 STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best beside the embedding bank
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
+# Of diffusers' multistep schedulers and spacings, these do best in those numbers of steps.
+SCHEDULERS: dict[str, tuple[Any, str]] = {
+    "touch-to-image": (DEISMultistepScheduler, "use_karras_sigmas"),
+    "x-to-touch": (UniPCMultistepScheduler, "use_exponential_sigmas"),
+}
+
+PLACES = {
+    "touch": "joint", "image_vae": "image-vae", "unclip": "touch-to-image", "touch_vae": "touch-vae",
+    "touch_ldm": "x-to-touch", "touch_llm": "touch-to-text",
+}  # fmt: skip
+"""Folders of a family, by the stages whose models they hold."""
 
 
-def halved(sources: list[Path], target: Path) -> None:
-    """Writes the weights of some files as one in fp16; integer and boolean tensors stay as they are."""
-    stored = [item for source in sources for item in load_file(source).items()]
-    state = {key: value.half() if value.is_floating_point() else value for key, value in stored}
-    save_file(state, target, metadata={"format": "pt"})
-
-
-def half_folder(source: Path, target: Path) -> None:
-    """Copies a saved model, its weights in fp16."""
-    shutil.copytree(source, target)
-    for file in target.rglob("*.safetensors"):
-        halved([file], file)
-    for file in target.rglob("config.json"):
+def halve(folder: Path) -> None:
+    """Turns all weights below a folder into fp16; integer and boolean tensors stay as they are."""
+    for file in folder.rglob("*.safetensors"):
+        tensors = load_file(file).items()  # mapped into memory: what stays is copied before its file is replaced
+        state = {key: value.half() if value.is_floating_point() else value.clone() for key, value in tensors}
+        save_file(state, file, metadata={"format": "pt"})
+    for file in folder.rglob("config.json"):
         settings = {key: value for key, value in json.loads(file.read_text()).items() if key != "_name_or_path"}
         write_json(settings, file)
 
 
 def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
-
-
-def write_generator(source: Path, target: Path, defaults: dict[str, Any], kind: Any, spacing: str) -> None:
-    """Writes what only one pipeline has: its networks, its defaults, and a scheduler over the trained schedule."""
-    for part in ("unet", "image_normalizer", "image_noising_scheduler", "backgrounds"):
-        if (source / part).is_dir():
-            half_folder(source / part, target / part)
-    config = DDPMScheduler.from_pretrained(source / "scheduler").config
-    kind(**{name: config[name] for name in TRAINED}, **{spacing: True}).save_pretrained(target / "scheduler")
-    write_json(defaults, target / "defaults.json")
 
 
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:
@@ -83,28 +77,24 @@ def assemble(
     Its `family.json` holds the stages' records and no figures: those an earlier one held were of other weights.
     """
     records = read_records(runs)
-    models = {stage: runs / stage / "model" for stage in STAGES}
     with writing_folder("output", output, replace=True) as place:
-        # The sensors are those that touch was trained on; everything else is the same in all three.
-        UniTouchConfig.from_pretrained(models["touch"]).save_pretrained(place / "joint")
-        UniTouchProcessor.from_pretrained(models["image_text"]).save_pretrained(place / "joint")
-        parts = [models[stage] / "model.safetensors" for stage in ("image_text", "audio", "touch")]
-        halved(parts, place / "joint" / "model.safetensors")
-        for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
-            half_folder(models[stage], place / stage.replace("_", "-"))
-        # Of diffusers' multistep schedulers and spacings, these do best in the number of steps above.
-        pictures = (TOUCH_TO_IMAGE, DEISMultistepScheduler, "use_karras_sigmas")
-        write_generator(models["unclip"], place / "touch-to-image", *pictures)
+        for stage, name in PLACES.items():
+            shutil.copytree(runs / stage / "model", place / name)
+        (place / "x-to-touch" / "embedding_bank").rename(place / "embedding-bank")
         (place / "stylization").mkdir()
-        write_json(STYLIZATION, place / "stylization" / "defaults.json")
-        ldm = models["touch_ldm"]
-        settings = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        write_generator(ldm, place / "x-to-touch", settings, UniPCMultistepScheduler, "use_exponential_sigmas")
-        half_folder(ldm / "embedding_bank", place / "embedding-bank")
-        half_folder(models["touch_llm"], place / "touch-to-text")
-        write_json({"prompt_template": PROMPT}, place / "touch-to-text" / "defaults.json")
+        sensors = place / "x-to-touch" / "sensors.json"
+        defaults = {
+            "touch-to-image": TOUCH_TO_IMAGE,
+            "stylization": STYLIZATION,
+            "x-to-touch": {"sensors": json.loads(sensors.read_text()), **X_TO_TOUCH},
+            "touch-to-text": {"prompt_template": PROMPT},
+        }
+        sensors.unlink()
+        for name, settings in defaults.items():
+            write_json(settings, place / name / "defaults.json")
+        for name, (kind, spacing) in SCHEDULERS.items():
+            config = DDPMScheduler.from_pretrained(place / name / "scheduler").config
+            scheduler = kind(**{key: config[key] for key in TRAINED}, **{spacing: True})
+            scheduler.save_pretrained(place / name / "scheduler")
+        halve(place)
         write_json({"training": records, "figures": {}}, place / "family.json")
-
-
-if __name__ == "__main__":
-    run_command("assemble", assemble)

@@ -1,6 +1,6 @@
 """Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023).
 
-python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
+python -m unitouch_gen.training audio --joint runs/image_text/model --output runs/audio
 """
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.stages import Recipe, Stage
 
 
 class AudioObjective(nn.Module):
@@ -33,15 +33,12 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def main(stage: Stage) -> None:
+def main(stage: Stage, recipe: Recipe) -> None:
     model = stage.joint_space("image")
     splits = stage.splits("image", "audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=stage.image_embeddings(model, splits))
     model.add("audio")
     stage.fit(AudioObjective(model), dataset)
     with stage.saving() as folder:
-        save_modalities(model, ("audio",), stage.processor, folder)
-
-
-if __name__ == "__main__":
-    run("audio", Recipe, main)
+        model.save_pretrained(folder)
+        stage.processor.save_pretrained(folder)

@@ -150,10 +150,7 @@ def add_noise(images: Tensor, deviation: float) -> Tensor:
     return (images + level * torch.randn_like(images)).clamp(0.0, 1.0)
 
 
-FARTHEST = 5.0  # deviations beyond which a measure pulls no harder
-
-
 def in_deviations(values: np.ndarray, axes: int | tuple[int, ...] = 0) -> np.ndarray:
-    """Measures around their mean over some axes, in units of their deviation, at most `FARTHEST`; float32."""
+    """Measures around their mean over some axes, in units of their deviation, at most 5; float32."""
     mean, deviation = (reduce(axis=axes, dtype=np.float64, keepdims=True) for reduce in (values.mean, values.std))
-    return ((values - mean) / deviation.clip(1e-3)).clip(-FARTHEST, FARTHEST).astype(np.float32)
+    return ((values - mean) / deviation.clip(1e-3)).clip(-5.0, 5.0).astype(np.float32)

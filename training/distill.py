@@ -1,6 +1,6 @@
 """A pipeline in four evaluations: distribution matching distillation (Yin et al., 2024, "DMD2") of LoRA layers.
 
-    python -m unitouch_gen.training.distill --model my-pipeline --output runs/distill
+    python -m unitouch_gen.training distill --model my-pipeline --output runs/distill
 
 The student is the network with LoRA layers. It draws as diffusers' `LCMScheduler` does, and learns to draw what guided
 sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers that learn to
@@ -32,7 +32,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.losses import denoising_loss, predict
 from unitouch_gen.training.recipe import Arguments, Settings, build, read, read_recipe
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 
 STUDENT, CRITIC = "student", "critic"
 """Names of the two sets of LoRA layers."""
@@ -205,8 +205,8 @@ CONDITIONED = {
 }
 
 
-def main(stage: Stage) -> None:
-    recipe, folder = stage.recipe, stage.folders["model"]
+def main(stage: Stage, recipe: DistillRecipe) -> None:
+    folder = stage.folders["model"]
     settings = read_settings("model", folder / "model_index.json")
     conditioned_by = CONDITIONED[check_choice("model: _class_name", class_name(settings), CONDITIONED)]
     with reading("model", folder):
@@ -224,7 +224,3 @@ def main(stage: Stage) -> None:
         defaults = {"num_inference_steps": len(timesteps), "timesteps": timesteps, "guidance_scale": 1.0}
         settings = {f"default_{name}": value for name, value in defaults.items()}
         (place / "defaults.json").write_text(json.dumps(settings, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    run("distill", DistillRecipe, main)

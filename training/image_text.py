@@ -3,9 +3,10 @@
 Pictures of a drawn contact under two lamps can be bound to each other, as SimCLR binds views of an image (Chen et al.,
 2020). Captions do not say which contact a picture shows, and touches are bound to single pictures later.
 
-`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's.
+`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's and of
+the built-in tokenizer, which knows the world's words and every byte.
 
-python -m unitouch_gen.training.image_text --output runs/image_text
+python -m unitouch_gen.training image_text --output runs/image_text
 """
 
 import math
@@ -19,25 +20,29 @@ from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations
 from unitouch_gen.training.data.columns import relit
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
-from unitouch_gen.training.recipe import Arguments, build
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
-from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.training.recipe import Arguments, Settings, build
+from unitouch_gen.training.stages import Recipe, Stage
+from unitouch_gen.weights import JOINT
+from unitouch_gen.world import ATTRIBUTES
+
+SHOWN = tuple(name for name in ATTRIBUTES if name not in ("depth", "load"))
+"""Attributes that a picture shows: how hard a sensor is pressed leaves no trace in it."""
 
 
-class ImageTextSettings(AttributeSettings):
+class ImageTextSettings(Settings):
     """What drawn contacts add to CLIP."""
 
+    attributes: NonNegativeFloat = 0.0  # weight of the squared error of attributes, in units of their deviations
     captions: PositiveInt = 1  # of each drawn contact, one of which is drawn at every step
     views: NonNegativeFloat = 0.0  # weight of InfoNCE between pictures of a contact under two lamps
 
 
 class ImageTextRecipe(Recipe):
-    tokenizer: Arguments
     model: Arguments
     objective: ImageTextSettings = ImageTextSettings()
     sampler: SamplerSettings = SamplerSettings()  # alike to the weights that training starts from
@@ -53,7 +58,7 @@ class ImageTextObjective(nn.Module):
         super().__init__()
         self.model, self.settings = model, settings
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / model.config.temperature)))
-        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if settings.attributes else None
+        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN)) if settings.attributes else None
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = batches.shift_pixels(batch["image"].float() / 255, 4)
@@ -82,25 +87,30 @@ def recoloured(pictures: Tensor) -> Tensor:
     return batches.add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
 
 
-def main(stage: Stage) -> None:
-    recipe: ImageTextRecipe = stage.recipe
+def main(stage: Stage, recipe: ImageTextRecipe) -> None:
     init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
-    build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits, processor = stage.splits("image", "text"), stage.processor
     captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
     texts = [caption for one in captions for caption in one]
     if init is not None:
-        model = UniTouchModel.from_pretrained(init, modalities=("image", "text"), dtype=torch.float32)
+        begun = UniTouchModel.from_pretrained(init, modalities=("image", "text"))
+        begun.config.ood_thresholds, begun.config.sensor_reaches = {}, {}
+        # Its touch and audio are bound to what its pictures were.
+        model = UniTouchModel(begun.config, modalities=())  # type: ignore[arg-type]
+        for modality in ("image", "text"):
+            model.load_tensors(modality, begun.state_dict())
     else:
-        processor.tokenizer = tokenizer = build("tokenizer", train_tokenizer, recipe.tokenizer, texts=texts)
+        processor.tokenizer = tokenizer = read_tokenizer("tokenizer", JOINT)
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
         config.text_config.update({"vocab_size": len(tokenizer), **special})  # type: ignore[union-attr]
         model = UniTouchModel(config, modalities=("image", "text"))
 
     data: dict[str, Any] = {"image": [split.image for split in splits]}
     if objective.attributes:
-        data["attributes"] = in_deviations(np.asarray(columns(splits, "image", SHOWN["image"]).columns["attributes"]))
+        chosen = [ATTRIBUTES.index(name) for name in SHOWN]
+        measured = [np.asarray(split.attributes)[:, :, chosen].mean(axis=1) for split in splits]  # by both sensors
+        data["attributes"] = in_deviations(np.concatenate(measured))
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.views:
         pairs = zip(stage.sources, splits, strict=True)
@@ -114,8 +124,5 @@ def main(stage: Stage) -> None:
     embeddings = stage.image_embeddings(model, splits).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings, axis=1).mean())
     with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
-        save_modalities(model, ("image", "text"), processor, folder)
-
-
-if __name__ == "__main__":
-    run("image_text", ImageTextRecipe, main)
+        model.save_pretrained(folder)
+        processor.save_pretrained(folder)

@@ -1,6 +1,6 @@
-"""Stage 4, the autoencoder of pictures, and the objective that stage 7, of touches, shares.
+"""Stage 4, the autoencoder of pictures, and the objective that stage 6, of touches, shares.
 
-    python -m unitouch_gen.training.image_vae --output runs/image_vae
+    python -m unitouch_gen.training image_vae --output runs/image_vae
 
 Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers' own unCLIP pipelines take as well as an
 `AutoencoderKL`, at a fraction of its time, and the paper's `VQModel` (Esser et al., 2021).
@@ -23,7 +23,7 @@ from unitouch_gen.models.autoencoders import CLASSES, Autoencoder, encode, encod
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
 from unitouch_gen.training.recipe import Arguments, Settings, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 
 
 class AutoencoderLoss(Settings):
@@ -101,8 +101,7 @@ def make_autoencoder(model: Arguments) -> Autoencoder:
     return build("model", getattr(diffusers, name), {key: value for key, value in model.items() if key != "class"})
 
 
-def main(stage: Stage) -> None:
-    recipe: AutoencoderRecipe = stage.recipe
+def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     modality = "touch" if stage.name == "touch_vae" else "image"
     init, crop = stage.folders.get("init"), recipe.augment.crop
     vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
@@ -119,7 +118,3 @@ def main(stage: Stage) -> None:
             settings = json.loads((folder / "config.json").read_text())
             del settings["block_out_channels"]
             (folder / "config.json").write_text(json.dumps(settings, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    run("image_vae", AutoencoderRecipe, main)

@@ -1,29 +1,27 @@
-"""The tiny family's language model: a LLaMA with a tokenizer of its own, from nothing, on what the world can be asked.
+"""The tiny family's language model: a LLaMA with the built-in tokenizer, from nothing, on what the world can be asked.
 
 It is so small, and reads so little, that a bridge into one that was trained on words alone hardly moves it. So it is
 trained with a bridge from pictures' embeddings, which is left: `touch_llm` trains another, with the model frozen.
 
-python -m unitouch_gen.training.language_model --joint runs/image_text/model --output runs/language_model
+python -m unitouch_gen.training language_model --joint runs/image_text/model --output runs/language_model
 """
 
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from pydantic import NonNegativeFloat
-from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from torch import Tensor, nn
-from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerBase, PreTrainedTokenizerFast
+from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerBase
 
-from unitouch_gen.errors import check_integer
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
+from unitouch_gen.weights import TOUCH_TO_TEXT
 from unitouch_gen.world import World
 from unitouch_gen.world.questions import TOPICS, answered
 
@@ -39,7 +37,6 @@ class AnswerSettings(Settings):
 
 
 class LanguageModelRecipe(Recipe):
-    tokenizer: Arguments
     model: Arguments
     bridge: Arguments  # of `LanguageBridge.for_model`, which is trained beside it and left
     objective: AnswerSettings
@@ -99,32 +96,12 @@ def encoded(tokenizer: PreTrainedTokenizerBase, pairs: Sequence[Pairs]) -> dict[
     return {name: column.view(len(pairs), -1, ids.shape[1]) for name, column in columns.items()}
 
 
-def train_language_tokenizer(texts: Iterable[str], vocab_size: int) -> PreTrainedTokenizerFast:
-    """Byte-pair encoding of texts; every byte is in the vocabulary. Prompts begin with <s>, and answers end in </s>."""
-    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    check_integer("vocab_size", vocab_size, len(alphabet) + 3, 2**15)
-    core, byte_level = Tokenizer(models.BPE()), pre_tokenizers.ByteLevel(add_prefix_space=False)
-    core.pre_tokenizer = byte_level
-    named = ["<pad>", "<s>", "</s>", *alphabet]  # the trainer numbers what is not named in no fixed order
-    trainer = trainers.BpeTrainer(vocab_size=vocab_size, special_tokens=named, show_progress=False)
-    core.train_from_iterator(texts, trainer)
-    trained = json.loads(core.to_str())["model"]
-    made = Tokenizer(models.BPE(trained["vocab"], [tuple(merge) for merge in trained["merges"]]))
-    made.pre_tokenizer, made.decoder = byte_level, decoders.ByteLevel()
-    made.post_processor = processors.TemplateProcessing(
-        single="<s> $A", pair="<s> $A:0 $B:1 </s>:1", special_tokens=[("<s>", 1), ("</s>", 2)]
-    )
-    return PreTrainedTokenizerFast(tokenizer_object=made, pad_token="<pad>", bos_token="<s>", eos_token="</s>")
-
-
-def main(stage: Stage) -> None:
-    recipe: LanguageModelRecipe = stage.recipe
-    build("tokenizer", train_language_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
+def main(stage: Stage, recipe: LanguageModelRecipe) -> None:
     joint, splits = stage.joint_space("image"), stage.splits("image", "text")
     pairs = pairs_of(stage.sources, splits)
-    texts = (text for one in pairs for pair in one for text in pair)
-    tokenizer = build("tokenizer", train_language_tokenizer, recipe.tokenizer, texts=texts)
-    special = {"vocab_size": len(tokenizer), "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
+    tokenizer = AutoTokenizer.from_pretrained(TOUCH_TO_TEXT / "language_model")  # knows every byte
+    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
+    special["vocab_size"] = len(tokenizer)
     model = LlamaForCausalLM(build("model", LlamaConfig, recipe.model, **special))
     bridge = build_bridge("bridge", recipe.bridge, model, joint)
     dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **encoded(tokenizer, pairs))
@@ -137,7 +114,3 @@ def main(stage: Stage) -> None:
 def build_bridge(section: str, arguments: Arguments, language_model: LlamaForCausalLM, joint: UniTouchModel) -> Any:
     given = {"language_model": language_model, "embedding_dim": joint.config.projection_dim}
     return build(section, LanguageBridge.for_model, arguments, **given)
-
-
-if __name__ == "__main__":
-    run("language_model", LanguageModelRecipe, main)

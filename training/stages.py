@@ -2,32 +2,27 @@
 
 import hashlib
 import json
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from datetime import timedelta
 from functools import cached_property, partial
-from inspect import signature
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
-import typer
 from accelerate import PartialState
 from accelerate.utils import parse_flag_from_env
 from diffusers import UNet2DConditionModel
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from typer import Option
 
 from unitouch_gen import __version__
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
@@ -36,13 +31,11 @@ from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 STAGES: dict[str, dict[str, str]] = {
     "image_text": {},
     "audio": {"joint": "image_text"},
-    "touch": {"joint": "image_text"},
+    "touch": {"joint": "audio"},
     "image_vae": {},
     "unclip": {"joint": "image_text", "vae": "image_vae"},
-    "picture_classifier": {},
     "touch_vae": {},
     "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
-    "touch_classifier": {},
     "language_model": {"joint": "image_text"},
     "touch_llm": {"joint": "image_text", "llama": "language_model"},
 }
@@ -53,6 +46,8 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 
 NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
 
+MODULES = {"touch_vae": "image_vae"}
+"""Modules of stages that have none of their own."""
 
 Indices = Callable[[int], Sequence[int]]  # those of a batch by the number of its step
 
@@ -206,7 +201,7 @@ def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
     places = {option: runs / before / "model" if before in STAGES else before for option, before in NEEDS[name].items()}
     needs = [f"--{option} {place}" for option, place in places.items()]
-    return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
+    return " ".join([f"python -m unitouch_gen.training {name}", *needs, f"--output {runs / name}"])
 
 
 def weights_of(folder: Path) -> str:
@@ -219,42 +214,9 @@ def weights_of(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def save_modalities(
-    model: UniTouchModel, modalities: Sequence[str], processor: UniTouchProcessor, folder: Path
-) -> None:
-    """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
-    config, names = deepcopy(model.config), [name for modality in modalities for name in MODULES[modality]]
-    if "touch" in modalities:
-        names.append("out_of_distribution")
-    else:
-        config.ood_thresholds, config.sensor_reaches = {}, {}  # of other weights
-    config.save_pretrained(folder)
-    processor.save_pretrained(folder)
-    kept = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] in names}
-    state = {key: value.contiguous().clone() for key, value in kept.items()}
-    save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
-
-
-def run_stage(name: str, kind: type[Recipe], main: Callable[[Stage], None], **options: Any) -> None:
-    """Runs a stage by its options, from its seed."""
-    stage = Stage(name, kind, **options)
+def run_stage(name: str, **options: Any) -> None:
+    """Runs a stage by its options, from its seed; `recipe` of its `main` says what it is read as."""
+    main = import_module(f"unitouch_gen.training.{MODULES.get(name, name)}").main
+    stage = Stage(name, main.__annotations__["recipe"], **options)
     torch.manual_seed(stage.trainer.seed)
-    main(stage)
-
-
-def run(name: str, kind: type[Recipe], main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
-    """Runs a stage by its command line, or by words in place of those that the process was started with."""
-
-    def command(**options: Any) -> None:
-        run_stage(name, kind, main, **options)
-
-    command.__signature__ = signature(partial(Stage, name, kind))  # type: ignore[attr-defined]
-    run_command(name, command, words)
-
-
-def run_command(name: str, function: Callable[..., None], words: Sequence[str] | None = None) -> None:
-    """Runs a function by a command line of its arguments; see `run_commands` for how mistakes end it."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(help=(function.__doc__ or "").partition("\n")[0])(function)
-    if code := run_commands(app, "unitouch_gen.training", words, prog_name=f"python -m unitouch_gen.training.{name}"):
-        sys.exit(code)
+    main(stage, stage.recipe)

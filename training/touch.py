@@ -1,8 +1,11 @@
 """Stage 3, touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
 
-python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
+At its end it fits the distance that tells which touches are unlike those the encoder was trained on.
+
+python -m unitouch_gen.training touch --joint runs/audio/model --output runs/touch
 """
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,15 +19,17 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
-from unitouch_gen.training.abstention import ABSTAINED, fit_distance, spread
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
 from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
+
+ABSTAINED = 0.046  # share of the touches of training that are beyond the threshold
 
 
 class TouchAugmentation(Settings):
@@ -151,6 +156,11 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
             model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
 
 
+def spread(values: np.ndarray, count: int = 500) -> np.ndarray:
+    """At most `count` rows, spread over all."""
+    return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))]
+
+
 def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training.
 
@@ -169,6 +179,41 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool =
             model.config.sensor_reaches[name] = distances.quantile(1.0 - ABSTAINED / 2).item()
 
 
+def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> Gaussians:
+    """Gaussians of one covariance around the mean of each class, of features (N, F) with int64 labels (N,).
+
+    `shrinkage` is the share of the covariance, of features in units of their deviation, that is the unit matrix.
+    """
+    values = features.double()
+    names, rows = labels.unique(return_inverse=True)
+    means = torch.stack([values[rows == row].mean(dim=0) for row in range(len(names))])
+    deviation = values.std(dim=0).clamp_min(1e-6)
+    residuals = (values - means[rows]) / deviation
+    covariance = residuals.T @ residuals / len(residuals)
+    scale, axes = torch.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * torch.eye(len(covariance)).double())
+    return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
+
+
+@torch.no_grad()
+def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
+    """Gives a model the distance of touches, by class where materials are known, and its threshold."""
+    stem, weight = model.touch_model.stem, model.touch_model.projection.weight
+
+    def statistics(images: Iterable[np.ndarray]) -> Tensor:
+        pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
+        parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
+        return torch.cat([touch_statistics(stem(part.to(weight)), part) for part in parts]).cpu()
+
+    cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
+    pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]
+    rows = torch.from_numpy(np.concatenate(pressed)) > 0.0
+    materials = torch.from_numpy(np.concatenate([spread(split.material) for split in splits]))[rows]
+    touches, pictures = statistics(split.touch for split in splits)[rows], statistics(split.image for split in splits)
+    distance = RelativeDistance(fit_gaussians(touches, materials), fit_gaussians(pictures, torch.zeros(len(pictures))))
+    model.out_of_distribution["touch"] = distance
+    model.config.ood_thresholds = {"touch": {"foreign": distance(touches).quantile(1.0 - ABSTAINED).item()}}
+
+
 def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
     """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation."""
     attributes, maps = (np.concatenate([getattr(split, name) for split in splits]) for name in ("attributes", "maps"))
@@ -179,8 +224,7 @@ def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
     }
 
 
-def main(stage: Stage) -> None:
-    recipe: TouchRecipe = stage.recipe
+def main(stage: Stage, recipe: TouchRecipe) -> None:
     stage.check_drawn(*recipe.objective.pairs)
     share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     model = stage.joint_space("image")
@@ -204,8 +248,5 @@ def main(stage: Stage) -> None:
     stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
     fit_distance(model, splits)
     with stage.saving() as folder:
-        save_modalities(model, ("touch",), stage.processor, folder)
-
-
-if __name__ == "__main__":
-    run("touch", TouchRecipe, main)
+        model.save_pretrained(folder)
+        stage.processor.save_pretrained(folder)

@@ -1,6 +1,6 @@
-"""Stage 8, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
+"""Stage 7, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
 
-    python -m unitouch_gen.training.touch_ldm --joint runs/image_text/model --vae runs/touch_vae/model \
+    python -m unitouch_gen.training touch_ldm --joint runs/image_text/model --vae runs/touch_vae/model \
         --output runs/touch_ldm
 
 It is trained on image embeddings alone, so text and sound, bound to images, can take their place. The autoencoder and
@@ -32,7 +32,7 @@ from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import StepPower, denoising_loss
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 
 
 class TouchDiffusionSettings(Settings):
@@ -128,8 +128,7 @@ def inputs(
     return dataset, latents_of("untouched", gels)
 
 
-def main(stage: Stage) -> None:
-    recipe: TouchDiffusionRecipe = stage.recipe
+def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
@@ -159,7 +158,3 @@ def main(stage: Stage) -> None:
             labels, places = (np.asarray(dataset.columns[name]) for name in ("sensor", "background"))
             own = [int(places[labels == label][0]) for label in range(len(sensors))]
             SensorBackgrounds.of(table[own]).save_pretrained(folder / "backgrounds")
-
-
-if __name__ == "__main__":
-    run("touch_ldm", TouchDiffusionRecipe, main)

@@ -1,6 +1,6 @@
 """Stage 5, pictures from image embeddings: an unCLIP UNet (Ramesh et al., 2022; Rombach et al., 2022).
 
-    python -m unitouch_gen.training.unclip --joint runs/image_text/model --vae runs/image_vae/model --output runs/unclip
+    python -m unitouch_gen.training unclip --joint runs/image_text/model --vae runs/image_vae/model --output runs/unclip
 
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
@@ -21,7 +21,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import StepPower, denoising_loss
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
-from unitouch_gen.training.stages import Recipe, Stage, run
+from unitouch_gen.training.stages import Recipe, Stage
 
 
 class UnclipSettings(Settings):
@@ -114,8 +114,7 @@ def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayD
     return ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))), captions
 
 
-def main(stage: Stage) -> None:
-    recipe: UnclipRecipe = stage.recipe
+def main(stage: Stage, recipe: UnclipRecipe) -> None:
     joint = stage.joint_space("image", "text")
     unet = stage.unet(recipe.model)
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
@@ -130,7 +129,3 @@ def main(stage: Stage) -> None:
         scheduler.save_pretrained(folder / "scheduler")
         normalizer.save_pretrained(folder / "image_normalizer")
         noising.save_pretrained(folder / "image_noising_scheduler")
-
-
-if __name__ == "__main__":
-    run("unclip", UnclipRecipe, main)

@@ -34,35 +34,30 @@ def held_out(
 
 @dataclass
 class JointSpace:
-    """Encoders of one space, which may lie in several folders: each modality is of the first that has it."""
+    """Encoders and what prepares their inputs."""
 
-    models: dict[str, UniTouchModel]
+    model: UniTouchModel
     processor: UniTouchProcessor
 
     @classmethod
-    def from_folders(cls, folders: Sequence[Path]) -> "JointSpace":
-        models: dict[str, UniTouchModel] = {}
-        for folder in folders:
-            model = UniTouchModel.from_pretrained(folder).eval()
-            models = {**dict.fromkeys(model.known_modalities, model), **models}
-        return cls(models, UniTouchProcessor.from_pretrained(folders[0]))
+    def from_folder(cls, folder: Path) -> "JointSpace":
+        return cls(UniTouchModel.from_pretrained(folder), UniTouchProcessor.from_pretrained(folder))
 
     @torch.no_grad()
     def features(self, modality: str, values: Any) -> Tensor:
         """Unit embeddings (N, D) of pictures or touches, of log-mel clips, or of captions."""
-        model = self.models[modality]
         if modality == "text":
-            return text_embeddings(model, self.processor, values)
+            return text_embeddings(self.model, self.processor, values)
         if modality == "audio":
-            parts = torch.from_numpy(np.array(values)).split(256)
-            return F.normalize(torch.cat([model.get_audio_features(part.float()[:, None]) for part in parts]), dim=1)
-        return F.normalize(image_embeddings(model, modality, values), dim=1)
+            parts = torch.from_numpy(np.array(values)).float()[:, None].split(256)
+            return F.normalize(torch.cat([self.model.get_audio_features(part) for part in parts]), dim=1)
+        return F.normalize(image_embeddings(self.model, modality, values), dim=1)
 
 
 def material_rows(joint: JointSpace, modality: str, features: Tensor, material: Tensor) -> Figures:
     """The share of embeddings whose "material" is named right."""
     texts = [PROMPTS[modality].format(name) for name in MATERIAL_NAMES]
-    classes = text_embeddings(joint.models["text"], joint.processor, texts)
+    classes = text_embeddings(joint.model, joint.processor, texts)
 
     def measure(values: Tensor) -> dict[str, float]:
         return {"material": share_right((F.normalize(values.float(), dim=-1) @ classes.T).argmax(dim=1), material)}
@@ -79,7 +74,7 @@ def found_within(queries: Tensor, gallery: Tensor, labels: Tensor, size: int) ->
     return with_controls(measure, {"value": queries, "class_mean": class_means(queries, labels)})["found"]
 
 
-def agreed(read: Tensor, usual: Tensor, truth: Tensor, names: Sequence[str], real: Tensor | None = None) -> Figures:
+def agreed(read: Tensor, usual: Tensor, truth: Tensor, names: Sequence[str], real: Tensor) -> Figures:
     """`attribute_agreement` of what is read (N, K), beside the best that a class can tell and what real images say."""
-    columns = {"value": read, "class_mean": usual, **({} if real is None else {"ceiling": real})}
+    columns = {"value": read, "class_mean": usual, "ceiling": real}
     return with_controls(lambda values: attribute_agreement(values, truth, names), columns)

@@ -1,9 +1,9 @@
 """What a joint space and a family are worth on the world and on real touches, each figure beside its controls.
 
-    python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model -o quality.json
+    python -m tests.benchmarks.quality --joint runs/touch/model -o quality.json
         the joint space alone: sensors that nobody has seen, objects held out
     python -m tests.benchmarks.quality --family runs/family --touched-by gelsight --photos FOLDER
-        and what its pipelines make of a GelSight's touches, judged by its classifiers; photos are restyled, too
+        and what its pipelines make of a GelSight's touches, by the built-in classifiers; photos are restyled, too
     python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER
         and real touches: the `gelsight_objects.zip` of `clips`, and if it is there `objectfolder_dataPack.npz`, the
         ball presses of ObjectFolder 2.0 (github.com/rhgao/ObjectFolder, calibs/)
@@ -65,20 +65,16 @@ UNTRAINED = 5
 """Untrained encoders that a figure of few objects is the mean of: one by one they differ by several points."""
 
 
-def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactClassifier | None) -> Figures:
+def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactClassifier) -> Figures:
     """Material by zero-shot, contacts told from others of their material, and what is read linearly off touches."""
     material, truth, rows = contacts.material, contacts.attributes, {}
     size = min(AMONG, int(torch.bincount(material).min()))
-    embeds = {
-        name: joint.features(name, getattr(contacts, name))
-        for name in ("touch", "image", "audio", "text")
-        if name in joint.models
-    }
-    real: Any = None if touch_classifier is None else touch_classifier.observe(float_pixels(contacts.touch))
-    if "text" in joint.models:
+    embeds = {name: joint.features(name, getattr(contacts, name)) for name in joint.model.known_modalities}
+    real: Any = touch_classifier.observe(float_pixels(contacts.touch))
+    if "text" in embeds:
         for name, features in embeds.items():
             found = material_rows(joint, name, features, material)
-            if name == "touch" and real is not None:
+            if name == "touch":
                 found["material"]["ceiling"] = share_right(real.logits.argmax(dim=1), material)
             rows |= {f"{name}: {key}": row for key, row in found.items()}
     if "touch" not in embeds:
@@ -94,8 +90,7 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
         fit, asked = fifths != fifth, fifths == fifth
         usual[asked] = class_means(truth[fit, 0], material[fit], material[asked])
     read = cross_predicted(touch, truth[:, 0], fifths)
-    seen = None if real is None or not touch_classifier.attributes else real.attributes
-    found = agreed(read, usual, truth[:, 0], ATTRIBUTES, seen)
+    found = agreed(read, usual, truth[:, 0], ATTRIBUTES, real.attributes)
     return rows | {f"touch, read linearly: {name}": row for name, row in found.items()}
 
 
@@ -245,8 +240,8 @@ def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, se
 
 def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     """Probes of real touches, beside plain statistics, the untouched gel and untrained encoders."""
-    spaces = {"touch encoder": joint.models["touch"]}
-    spaces |= {f"untrained {seed}": untrained_like(joint.models["touch"], seed) for seed in range(UNTRAINED)}
+    spaces = {"touch encoder": joint.model}
+    spaces |= {f"untrained {seed}": untrained_like(joint.model, seed) for seed in range(UNTRAINED)}
     size, figures = joint.processor.image_size, {}
 
     def embedded(pixels: np.ndarray) -> dict[str, np.ndarray]:
@@ -278,7 +273,7 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
 @torch.no_grad()
 def abstained(joint: JointSpace, touches: np.ndarray) -> dict[str, float]:
     """Shares of uint8 touches (N, 3, S, S) that are called untouched, and unlike anything known."""
-    model, reasons = joint.models["touch"], list[str | None]()
+    model, reasons = joint.model, list[str | None]()
     for part in torch.from_numpy(touches).split(256):
         reasons += model.encode_touches(normalise_pixels(part.float() / 255))[1]
     return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
@@ -304,10 +299,9 @@ TURBO_ROWS: dict[str, tuple[Callable[..., Figures], str]] = {
 
 def measure(given: argparse.Namespace, cache: Path) -> Figures:
     """All that can be measured of what was given."""
-    joint = JointSpace.from_folders(given.joint)
-    judges = {
-        name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in given.classifiers.items()
-    }
+    joint = JointSpace.from_folder(given.joint)
+    folders = {"image": given.picture_classifier, "touch": given.touch_classifier}
+    judges = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
     pipes = {name: quiet(name, family=given.family) for name in given.pipelines if given.family}
     seeds = [given.first_seed + number for number in range(given.seeds)]
     figures: Figures = {"split": given.split, "seeds": seeds, "touched_by": given.touched_by or "drawn"}
@@ -316,7 +310,7 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     rows = []
     for seed in seeds:
         contacts = held_out(cache, joint.processor, seed, given.split, given.touched_by, given.objects)
-        found, drawn = joint_rows(joint, contacts, judges.get("touch")), (seed, given.each)
+        found, drawn = joint_rows(joint, contacts, judges["touch"]), (seed, given.each)
         if "touch-to-image" in pipes:
             found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn)
         if "stylization" in pipes:
@@ -353,10 +347,10 @@ def quality_figures(recordings: Path | None, photos: Path | None, seeds: int) ->
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.quality")
-    parser.add_argument("--joint", nargs="+", type=Path, help="folders of the joint space; the family's if left out")
+    parser.add_argument("--joint", type=Path, help="folder of the joint space; the family's if left out")
     parser.add_argument("--family", type=Path, help="folder with the layout of the built-in one: what it makes")
-    parser.add_argument("--picture-classifier", type=Path, help="folder; the family's if left out")
-    parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
+    parser.add_argument("--picture-classifier", type=Path, default=weights.PICTURE_CLASSIFIER, help="folder")
+    parser.add_argument("--touch-classifier", type=Path, default=weights.TOUCH_CLASSIFIER, help="folder")
     parser.add_argument("--recordings", type=Path, help=f"folder with {GELSIGHT}, and perhaps {PRESSES}")
     parser.add_argument("--touched-by", choices=SENSORS, help="whose touches are read; drawn ones if left out")
     parser.add_argument("--split", default="test", choices=("val", "test", "beyond"))
@@ -375,11 +369,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("name `--joint` or `--family`.")
     distilled = [name for name, of in TURBO.items() if given.family and (given.family / of / "turbo").is_dir()]
     given.pipelines = given.pipelines or [*PIPELINES, *distilled]
-    given.joint = given.joint or [given.family / weights.JOINT.name]
-    own = {"image": given.picture_classifier, "touch": given.touch_classifier}
-    built_in = {"image": weights.PICTURE_CLASSIFIER.name, "touch": weights.TOUCH_CLASSIFIER.name}
-    chosen = {name: folder or (given.family and given.family / built_in[name]) for name, folder in own.items()}
-    given.classifiers = {name: folder for name, folder in chosen.items() if folder}
+    given.joint = given.joint or given.family / weights.JOINT.name
     return given
 
 

@@ -6,19 +6,23 @@ from typing import Any
 
 import pytest
 import torch
+from accelerate.state import AcceleratorState
 from diffusers import DDIMScheduler
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
-from tests.benchmarks import quality
+from tests.benchmarks import judges, quality
 from tests.benchmarks.error_and_time import cost_figures, usual_way
 from tests.benchmarks.files_entered import functions_entered
 from tests.benchmarks.tables import MARKS, ROOT, card_settings, write_pages
 from tests.benchmarks.world import physics_figures
-from tests.helpers.components import make_components
+from tests.helpers.components import AUDIO, make_components
 from unitouch_gen import weights
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.pipelines import TouchToImagePipeline
-from unitouch_gen.world import SENSORS, World
+from unitouch_gen.training.data import DataConfig
+from unitouch_gen.training.trainer import TrainerConfig
+from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
 from unitouch_gen.world.scene import MODALITIES
 
 pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
@@ -85,6 +89,19 @@ def test_the_built_in_joint_space_is_beside_its_controls(tmp_path):
     words = ["--joint", str(weights.JOINT), "--seeds", "1", "--objects", "2"]
     rows = quality.measure(quality.arguments(words), tmp_path)["rows"]
     assert rows["touch: material"]["value"] > rows["touch: material"]["shuffled"]
+
+
+def test_classifiers_learn_materials_and_attributes(tmp_path, monkeypatch):
+    AcceleratorState._reset_state()  # as a process of its own would find it
+    monkeypatch.setattr(judges, "SIZES", {"embedding_size": 8, "hidden_sizes": [8], "depths": [1]})
+    drawn = {"sensors": ["digit"], "objects": 1, "contacts_per_object": 1}
+    trainer = TrainerConfig(steps=2, batch_size=8, learning_rate=1e-3, ema_decay=0.5)
+    for kind, count in (("picture", 11), ("touch", 13)):
+        data = DataConfig(image_size=32, audio=AUDIO, drawn=drawn)
+        judges.train(kind, data, trainer, tmp_path / kind, tmp_path / "cache")
+        classifier = ContactClassifier.from_pretrained(tmp_path / kind, dtype=torch.float32)
+        seen = classifier.observe(torch.rand(2, 3, 32, 32))
+        assert seen.attributes.shape == (2, count) and [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
 def test_stored_figures_fill_the_marks_of_all_pages_and_the_cards(tmp_path):

@@ -64,8 +64,8 @@ def two_digits(joint: JointSpace, archive: Path) -> Figures:
     mean = {unit: pixels[torch.from_numpy(first == unit)].mean(dim=0) for unit in (True, False)}
     pairs = zip(pixels, first.tolist(), strict=True)
     changes = [(128.0 * (one - mean[unit])).movedim(0, -1).numpy() for one, unit in pairs]
-    models = {"touch encoder": joint.models["touch"]}
-    models |= {f"untrained {seed}": untrained_like(joint.models["touch"], seed) for seed in range(3)}
+    models = {"touch encoder": joint.model}
+    models |= {f"untrained {seed}": untrained_like(joint.model, seed) for seed in range(3)}
     features = dict[str, np.ndarray]()
     for name, model in models.items():
         found = [F.normalize(encoded(model, view), dim=1) for view in (views(pixels) if name in AVERAGED else [pixels])]
@@ -105,7 +105,7 @@ def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.two_digits")
     parser.add_argument("recordings", type=Path, help="digit_touchtouch.zip")
-    parser.add_argument("--joint", nargs="+", type=Path, default=[weights.JOINT], help="folders of a joint space")
+    parser.add_argument("--joint", type=Path, default=weights.JOINT, help="folder of a joint space")
     given = parser.parse_args()
-    for name, found in two_digits(JointSpace.from_folders(given.joint), given.recordings).items():
+    for name, found in two_digits(JointSpace.from_folder(given.joint), given.recordings).items():
         print(f"{name}: AUC {found['auc']:.3f} +- {found['spread']:.3f}, nearest {100 * found['nearest']:.0f} %")

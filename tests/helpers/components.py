@@ -5,14 +5,14 @@ from typing import Any
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer, LlamaConfig, LlamaForCausalLM
+from transformers import AutoTokenizer, CLIPTextConfig, CLIPTextModel, CLIPTokenizer, LlamaConfig, LlamaForCausalLM
 
+from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.language import LanguageBridge
+from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.training.language_model import train_language_tokenizer
-from unitouch_gen.training.tokenizer import train_tokenizer
 
 D = 16
 
@@ -39,6 +39,13 @@ LLAMA = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "nu
          "max_position_embeddings": 64, "tie_word_embeddings": True}  # fmt: skip
 
 
+def clip_tokenizer() -> CLIPTokenizer:
+    """The built-in one, which cuts and pads texts to twelve tokens."""
+    tokenizer = read_tokenizer("tokenizer", weights.JOINT)
+    tokenizer.model_max_length = 12
+    return tokenizer
+
+
 def joint_config(tokenizer: CLIPTokenizer, **changes: Any) -> UniTouchConfig:
     """Of a joint space that reads the tokenizer's words."""
     config = UniTouchConfig(**{**SPACE, **changes})
@@ -49,7 +56,7 @@ def joint_config(tokenizer: CLIPTokenizer, **changes: Any) -> UniTouchConfig:
 
 def make_components() -> dict:
     torch.manual_seed(0)
-    tokenizer = train_tokenizer(["high quality rough brick", "smooth grey metal"], 600, 12)
+    tokenizer = clip_tokenizer()
     model = UniTouchModel(joint_config(tokenizer, embedding_norm=3.0)).eval()
     model.sensor_bank.set_prototype("gelsight", torch.full((3, 32, 32), 0.2))
     model.sensor_bank.set_prototype("digit", torch.full((3, 32, 32), 0.8))
@@ -89,7 +96,7 @@ def make_x_to_touch() -> dict:
 def make_language_parts(**sizes: object) -> dict:
     """Those of a `TouchToTextPipeline`: a small LLaMA and a bridge whose gates are open, so that answers differ."""
     torch.manual_seed(0)
-    tokenizer = train_language_tokenizer(["How does it feel?\nit feels rough", "Where is it?"], 280)
+    tokenizer = AutoTokenizer.from_pretrained(weights.TOUCH_TO_TEXT / "language_model")
     special = {"vocab_size": len(tokenizer), "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
     model = LlamaForCausalLM(LlamaConfig(**{**LLAMA, **special, "initializer_range": 0.3, **sizes})).eval()
     bridge = LanguageBridge.for_model(model, D, num_blocks=2, intermediate_size=24).eval()

@@ -6,16 +6,15 @@ import pytest
 import torch
 from transformers import CLIPTokenizer
 
-from tests.helpers.components import AUDIO, joint_config
+from tests.helpers.components import AUDIO, clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.tokenizer import train_tokenizer
 
 SENSORS = ("gelsight", "digit", "taxim")
 
 
 @pytest.fixture(scope="session")
 def tokenizer() -> CLIPTokenizer:
-    return train_tokenizer(["a photo of rough red brick, a flat face", "slick glass", "touch of soft grass"], 600, 12)
+    return clip_tokenizer()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from unitouch_gen.models.classifier import ContactClassifier
 
 
 def test_images_are_seen_alike_whatever_the_batch() -> None:
-    classifier = ContactClassifier.from_pretrained(weights.PICTURE_CLASSIFIER).eval()
+    classifier = ContactClassifier.from_pretrained(weights.PICTURE_CLASSIFIER, dtype=torch.float32).eval()
     images = torch.rand(5, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     whole, parts = classifier.observe(images), classifier.observe(images, batch_size=2)
     assert {"logits", "features"} <= set(whole)
@@ -28,7 +28,8 @@ def test_images_are_seen_alike_whatever_the_batch() -> None:
 def test_shipped_classifiers_name_as_transformers_does(folder: Path) -> None:
     """Of touches that one is shown the relief, as it would not find it itself."""
     images = torch.randn(3, 3, 128, 128, generator=torch.Generator().manual_seed(0))
-    ours, theirs = (kind.from_pretrained(folder).eval() for kind in (ContactClassifier, ResNetForImageClassification))
+    kinds = (ContactClassifier, ResNetForImageClassification)
+    ours, theirs = (kind.from_pretrained(folder, dtype=torch.float32).eval() for kind in kinds)
     with torch.no_grad():
         seen = ours(images)
         assert torch.equal(seen.logits, theirs(ours.beside(images)).logits)

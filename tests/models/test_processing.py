@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+import unicodedata
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,16 @@ def test_text_becomes_padded_ids_between_start_and_end(processor: UniTouchProces
     assert tokenizer.decode(ids, skip_special_tokens=True).strip() == "rough brick"
     assert encoded["input_ids"][1, -1] == tokenizer.eos_token_id  # cut
     assert encoded["input_ids"].min() >= 0 and encoded["input_ids"].max() < len(tokenizer)
+
+
+def letters(text: str) -> str:
+    """What CLIP's normaliser keeps, without the spaces that decoding may move."""
+    return "".join(unicodedata.normalize("NFC", text).lower().split())
+
+
+@pytest.mark.parametrize("text", ["粗いレンガ", "العربية", "naïve café", "🧱 brick", "e\u0301", "a\tb\n c"])
+def test_the_built_in_tokenizer_loses_no_text(tokenizer: CLIPTokenizer, text: str) -> None:
+    assert letters(tokenizer.decode(tokenizer(text).input_ids, skip_special_tokens=True)) == letters(text)
 
 
 def test_a_tokenizer_that_cannot_pad_is_refused(tokenizer: CLIPTokenizer) -> None:

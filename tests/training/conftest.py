@@ -8,11 +8,9 @@ import torch
 from accelerate.state import AcceleratorState
 from diffusers import AutoencoderTiny
 
-from tests.helpers.components import AUDIO, joint_config
+from tests.helpers.components import AUDIO, clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
-from unitouch_gen.training.stages import save_modalities
-from unitouch_gen.training.tokenizer import train_tokenizer
 
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
@@ -32,8 +30,7 @@ def autoencoder(**changes: object) -> AutoencoderTiny:
 
 @pytest.fixture(scope="session")
 def _processor() -> UniTouchProcessor:
-    tokenizer = train_tokenizer(["a photo of rough red brick, a flat face", "slick glass"], 600, 12)
-    return UniTouchProcessor(image_size=32, audio=AUDIO, tokenizer=tokenizer)
+    return UniTouchProcessor(image_size=32, audio=AUDIO, tokenizer=clip_tokenizer())
 
 
 @pytest.fixture
@@ -66,9 +63,10 @@ def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
 
 
 @pytest.fixture
-def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) -> str:
+def joint(tmp_path: Path, config: UniTouchConfig, processor: UniTouchProcessor) -> str:
     """What the first stage leaves."""
-    save_modalities(model, ("image", "text"), processor, tmp_path / "joint")
+    UniTouchModel(config, modalities=("image", "text")).save_pretrained(tmp_path / "joint")
+    processor.save_pretrained(tmp_path / "joint")
     return str(tmp_path / "joint")
 
 

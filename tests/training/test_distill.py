@@ -21,8 +21,8 @@ from tests.helpers.small_family import write_small_family
 from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import run_commands
-from unitouch_gen.training.distill import DistillObjective, DistillRecipe, DistillSettings, add_layers, main
-from unitouch_gen.training.stages import run
+from unitouch_gen.training.__main__ import app
+from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers
 from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
@@ -135,22 +135,26 @@ def words_of(teacher: Path, output: Path, cache: Path, *words: str) -> list[str]
     return ["--model", str(teacher), "--output", str(output), "--cache", str(cache), *overrides, *words]
 
 
+def run(words: list[str]) -> None:
+    run_commands(app, "unitouch_gen.training", ["distill", *words])
+
+
 @pytest.mark.parametrize("name", PIPELINES)
 def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
     name: str, cache: Path, tmp_path: Path
 ) -> None:
     pipe = quiet(make_pipelines()[name])
     pipe.save_pretrained(tmp_path / "teacher")
-    run("distill", DistillRecipe, main, words_of(tmp_path / "teacher", tmp_path / "run", cache))
+    run(words_of(tmp_path / "teacher", tmp_path / "run", cache))
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (checkpoints_in(tmp_path / "again")[-1] / "progress.json").unlink()
     words = words_of(tmp_path / "teacher", tmp_path / "again", cache, "--resume")
     assert not run_commands(commands, "unitouch-gen", ["distill", *words])
     further = ["--init", str(tmp_path / "run" / "model"), "--set", "trainer.learning_rate=1e-9"]
-    run("distill", DistillRecipe, main, words_of(tmp_path / "teacher", tmp_path / "further", cache, *further))
+    run(words_of(tmp_path / "teacher", tmp_path / "further", cache, *further))
     wide = words_of(tmp_path / "teacher", tmp_path / "wide", cache, *further, "--set", "lora.r=3")
     with pytest.raises(SystemExit, match="2"):
-        run("distill", DistillRecipe, main, wide)
+        run(wide)
     stored = "model/pytorch_lora_weights.safetensors"
     layers, again, still = (load_file(tmp_path / run / stored) for run in ("run", "again", "further"))
     assert_close(still, layers, atol=1e-6, rtol=1e-3)
@@ -209,6 +213,6 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
     ):
         given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split(maxsplit=1))
         with pytest.raises(SystemExit, match="2"):
-            run("distill", DistillRecipe, main, given)
+            run(given)
         (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
         assert message in line and not (tmp_path / "run").exists()

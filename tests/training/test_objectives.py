@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from diffusers import DDPMScheduler, VQModel
 from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
+from scipy.spatial.distance import mahalanobis
 from scipy.stats import kstest
 from torch import Tensor, nn
 
@@ -21,9 +22,8 @@ from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of, sensor_numbers
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
-from unitouch_gen.training.picture_classifier import SHOWN, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
-from unitouch_gen.world import ATTRIBUTES, untouched_gel
+from unitouch_gen.world import untouched_gel
 
 COUNT, NORM = 600, 14.0
 SCHEDULER = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
@@ -92,6 +92,35 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
         touch.start_from(model, Path(joint))
 
 
+def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(model, processor, split, tmp_path):
+    splits = [split, replace(split, sensor="gelsight", touch=split.second)]
+    touch.set_prototypes(model, splits, reaches=True)
+    touch.fit_distance(model, splits)
+    model.save_pretrained(tmp_path / "touch")
+    again = UniTouchModel.from_pretrained(tmp_path / "touch")
+    assert [*again.config.ood_thresholds] == ["touch"]
+    reaches = again.config.sensor_reaches
+    assert set(reaches) == {"gelsight", "digit"} and 0.0 < reaches["digit"] < 0.3
+    for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
+        reasons = again.encode_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))[1]
+        assert low <= sum(map(bool, reasons)) / len(reasons) <= high
+
+
+def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
+    mixing = np.random.default_rng(0).normal(size=(6, 6)) * [1.0, 3.0, 0.1, 1.0, 10.0, 1.0]
+    drawn = np.random.default_rng(1).normal(size=(620, 6)) @ mixing
+    drawn[300:600] += mixing.sum(axis=0) * 4.0
+    features, labels, others = drawn[:600], np.repeat([0, 1], 300), drawn[600:]
+    means = [features[labels == label].mean(axis=0) for label in (0, 1)]
+    residuals = features - np.stack(means)[labels]
+    inverse = np.linalg.inv(residuals.T @ residuals / 600)
+    gaussians = touch.fit_gaussians(torch.from_numpy(features), torch.from_numpy(labels), shrinkage=0.0)
+    expected = [min(mahalanobis(row, mean, inverse) for mean in means) ** 2 for row in others]
+    np.testing.assert_allclose(gaussians(torch.from_numpy(others)), expected, rtol=1e-3)
+    halved = gaussians.half()(torch.from_numpy(others))
+    np.testing.assert_allclose(halved, expected, rtol=0.05, atol=0.1)
+
+
 def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differences() -> None:
     vae, batch = autoencoder(), {"pixels": torch.from_numpy(PICTURES)}
     losses = AutoencoderObjective(vae, PLAIN.model_copy(update={"gradient_weight": 0.5, "latent_weight": 0.1}))(batch)
@@ -133,16 +162,6 @@ def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of
     with torch.no_grad():
         next(vae.encoder.parameters()).mul_(1.5)
     assert not torch.allclose(image_vae.cached_latents(vae, [PICTURES], "k", tmp_path), latents / 2)
-
-
-def test_touches_of_both_sensors_have_their_own_attributes_and_pictures_the_mean(split: Rendered) -> None:
-    count, truth = len(split), np.asarray(split.attributes)
-    batch = columns([split], "touch", ATTRIBUTES)[range(2 * count)]
-    np.testing.assert_array_equal(batch["pixels"], np.concatenate([split.touch, split.second]))
-    np.testing.assert_array_equal(batch["attributes"], np.concatenate([truth[:, 0], truth[:, 1]]))
-    found = columns([split], "image", ("cover", "compliance"))[range(count)]["attributes"]
-    np.testing.assert_allclose(found, truth[:, :, [0, -1]].mean(axis=1), rtol=1e-6)
-    assert {*ATTRIBUTES} - {*SHOWN["image"]} == {"depth", "load"}
 
 
 class Shown(nn.Module):

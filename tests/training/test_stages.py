@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 from collections import defaultdict
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +15,17 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from tests.helpers.components import AUDIO, SPACE
-from tests.training.test_recipe import KINDS
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.assemble import assemble
-from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import STAGES, Stage, command_of, run, weights_of
+from unitouch_gen.training.stages import STAGES, Stage, command_of, weights_of
+from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
-from unitouch_gen.world import MATERIAL_NAMES, World
+from unitouch_gen.world import World
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHORT = (
@@ -40,20 +38,16 @@ ALONE = ("data.image_size=32", f"data.audio={json.dumps(AUDIO)}")
 VAE = tuple(f"model.{part}_block_out_channels=[8, 8, 8, 8]" for part in ("encoder", "decoder"))
 UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.attention_head_dim=1",
         "model.cross_attention_dim=16")  # fmt: skip
-RESNET = ("model.embedding_size=8", "model.hidden_sizes=[8]", "model.depths=[1]")
 SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 SETTINGS: dict[str, tuple[str, ...]] = {
-    "image_text": (*ALONE, *SPACED, "tokenizer.vocab_size=600", "objective.views=1.0", "sampler.sigma=0.75",
-                   "sampler.group=2"),
+    "image_text": (*ALONE, *SPACED, "objective.views=1.0", "sampler.sigma=0.75", "sampler.group=2"),
     "audio": (),
     "touch": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),
     "unclip": (*UNET, "model.projection_class_embeddings_input_dim=32"),
-    "picture_classifier": (*ALONE, *RESNET),
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
-    "touch_classifier": (*ALONE, *RESNET),
-    "language_model": ("tokenizer.vocab_size=300", "model.hidden_size=16", "model.intermediate_size=24"),
+    "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("model.intermediate_size=24",),
 }  # fmt: skip
 FROZEN = defaultdict(set, touch_llm={"language_model"})
@@ -65,9 +59,8 @@ def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None
     given = [word for option, before in STAGES[name].items() for word in (f"--{option}", str(runs / before / "model"))]
     overrides = [word for setting in (*SHORT, *SETTINGS[name]) for word in ("--set", setting)]
     places = ["--output", str(runs / (output or name)), "--cache", str(runs / "cache")]
-    main = import_module(f"unitouch_gen.training.{name}").main
     AcceleratorState._reset_state()  # as a process of its own would find it
-    run(name, KINDS[name], main, [*given, *overrides, *places, *words])
+    run_commands(app, "unitouch_gen.training", [name, *given, *overrides, *places, *words])
 
 
 @pytest.fixture(scope="module")
@@ -91,10 +84,6 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         still = {key for key, value in last.items() if torch.equal(value, first[key])}
         if name not in ("unclip", "touch_ldm"):  # group norms of single pixels learn nothing
             assert {key.split(".")[0] for key in still if not key.endswith(("known", "prototypes"))} <= FROZEN[name]
-    for name, modality in (("picture_classifier", "image"), ("touch_classifier", "touch")):
-        classifier = ContactClassifier.from_pretrained(runs / name / "model")
-        assert classifier.attributes == SHOWN[modality]
-        assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
 @pytest.mark.parametrize("name", ["touch", "unclip", "language_model", "touch_llm"])
@@ -110,14 +99,13 @@ def test_a_stage_that_was_stopped_goes_on_to_the_same_bits(name: str, runs: Path
 
 
 def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(runs: Path, tmp_path: Path) -> None:
-    began = shutil.copytree(runs / "image_text" / "model", tmp_path / "run" / "model")
-    config = json.loads((began / "config.json").read_text())
-    (began / "config.json").write_text(json.dumps({**config, "sensor_reaches": {"digit": 0.2}}))
+    began = shutil.copytree(runs / "touch" / "model", tmp_path / "run" / "model")
     (tmp_path / "run" / "record.json").write_text('{"seed": 3}')
     changed = ("--set", "objective.views=0")
     stage(runs, "image_text", "--init", str(began), *changed, output="kept")
     made = UniTouchModel.from_pretrained(runs / "kept" / "model")
-    assert made.config.sensor_reaches == {} and made.config.embedding_norm > 0
+    assert made.known_modalities == ("image", "text")  # to which no touch and no sound is bound yet
+    assert made.config.sensor_reaches == made.config.ood_thresholds == {} and made.config.embedding_norm > 0
     words = [UniTouchProcessor.from_pretrained(one).tokenizer.get_vocab() for one in (began, runs / "kept" / "model")]
     record = json.loads((runs / "kept" / "record.json").read_text())
     assert words[0] == words[1] and record["started_from"] == {"seed": 3}
@@ -149,19 +137,18 @@ def test_a_family_becomes_pictures_and_touches(family: Path) -> None:
 
 
 def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path, runs: Path) -> None:
-    kinds, expected = {}, 0
+    kinds = {}
     for path in family.rglob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             kinds[path] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
-    # the joint space; of pictures and of touches autoencoder, UNet and classifier; normaliser, bank, and
-    # untouched gels; language model and bridge
-    assert len(kinds) == 12 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
-    for part in ("image_text", "audio", "touch"):
+    # the joint space; of pictures and of touches autoencoder and UNet; normaliser, bank, and untouched gels; language
+    # model and bridge
+    assert len(kinds) == 10 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
+    stored = load_file(family / "joint" / "model.safetensors")
+    for part in ("image_text", "audio", "touch"):  # each leaves what was there as it was
         state = load_file(runs / part / "model" / "model.safetensors")
-        stored = load_file(family / "joint" / "model.safetensors")
-        expected += len(state)
         assert all(torch.equal(stored[key], v.half() if v.is_floating_point() else v) for key, v in state.items())
-    assert len(stored) == expected
+    assert {*stored} == {*state}
     assert [*json.loads((family / "family.json").read_text())["training"]] == [*STAGES]
 
 
@@ -185,12 +172,12 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
     place.mkdir(parents=True)
     (place / "progress.json").write_text(json.dumps({"step": 1, "seconds": 1.0, "recipe": recipe, "inputs": inputs}))
     given = {"joint": Path(joint), "output": tmp_path, "resume": True}
-    found = Stage("touch", KINDS["touch"], overrides=["trainer.steps=3"], **given)
+    found = Stage("touch", TouchRecipe, overrides=["trainer.steps=3"], **given)
     assert (found.recipe.sampler.sigma, found.trainer.steps) == (0.5, 3)
     file = next(Path(joint).rglob("*.safetensors"))
     save_file({"weight": torch.ones(2)}, file)
     with pytest.raises(InvalidInputError, match=r"was built on other weights than --joint"):
-        Stage("touch", KINDS["touch"], **given)
+        Stage("touch", TouchRecipe, **given)
 
 
 def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, vae, monkeypatch, capsys, tmp_path):
@@ -201,7 +188,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
-        ("touch", "", "touch needs folders of models: python -m unitouch_gen.training.touch --joint"),
+        ("touch", "", "touch needs folders of models: python -m unitouch_gen.training touch --joint"),
         ("audio", "--joint nowhere", "'nowhere' does not exist"),
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
@@ -210,9 +197,9 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
     ):
-        main = import_module(f"unitouch_gen.training.{name}").main
+        given = words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split()
         with pytest.raises(SystemExit, match="2"):
-            run(name, KINDS[name], main, words.format(joint=joint, vae=vae, unet=X_TO_TOUCH / "unet").split())
+            run_commands(app, "unitouch_gen.training", [name, *given])
         (error,) = capsys.readouterr().err.splitlines()
         assert message in error and list((tmp_path / "here").iterdir()) == []
 
@@ -222,23 +209,19 @@ def commands(runs: Path) -> list[str]:
     words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
     lines = done.stdout.replace("\\\n", " ").splitlines()
-    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training." in line]
+    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line]
     return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
 
 
 def expected(stage: str, runs: Path) -> list[str]:
     """Commands of a stage; pictures begin from captions alone, and touch from what it learns without pictures."""
     whole = command_of(stage, runs)
-    if stage == "image_text":
-        captions, output = runs / "captions", whole.split(" --output ")[1]
-        first = f"python -m unitouch_gen.training.image_text --output {captions}"
-        begun = f"python -m unitouch_gen.training.image_text --recipe image_text_lamps --init {captions / 'model'}"
-        return [first, f"{begun} --output {output}"]
-    if stage != "touch":
+    if stage not in ("image_text", "touch"):
         return [whole]
     start, output = whole.split(" --output ")
-    pairs = f"{start} --recipe touch_pairs --output {runs / 'touch_pairs'}"
-    return [pairs, f"{start} --init {runs / 'touch_pairs' / 'model'} --output {output}"]
+    before = runs / ("touch_pairs" if stage == "touch" else "captions")
+    pairs, lamps = (" --recipe touch_pairs", "") if stage == "touch" else ("", " --recipe image_text_lamps")
+    return [f"{start}{pairs} --output {before}", f"{start}{lamps} --init {before / 'model'} --output {output}"]
 
 
 @pytest.mark.skipif(
@@ -246,5 +229,5 @@ def expected(stage: str, runs: Path) -> list[str]:
 )
 def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
-    last = f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}"
+    last = f"python -m unitouch_gen.training assemble --runs {tmp_path} --output {family}"
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]

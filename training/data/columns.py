@@ -35,7 +35,6 @@ class SetConfig(Settings):
     kind: str = "auto"
     split: SplitBy | None = None
     sensor: str | None = None
-    materials: list[str] | None = None
     sampling_rate: PositiveInt | None = None
 
 
@@ -66,7 +65,7 @@ class Rendered:
     image: np.ndarray  # uint8 (N, 3, S, S)
     touch: np.ndarray  # uint8 (N, 3, T, T)
     audio: np.ndarray  # log-mel clips, float16 (N, 1, mel_bins, frames)
-    material: np.ndarray  # int64 (N,); -1 where it is not known
+    material: np.ndarray  # int64 (N,); -1 of data sets
     text: list[str]
     sensor: str | None  # its only one; None where each contact has drawn ones
     fingerprint: str  # what changes with any of it
@@ -83,8 +82,8 @@ FIELDS = {"image": "picture", "audio": "sound", "text": "caption"}  # of a recor
 
 
 def has(record: Record, need: str) -> bool:
-    """Whether a record has a column that a stage may need: touch, image, background, audio, text, material, sensor."""
-    return need in record.labels if need == "material" else getattr(record, FIELDS.get(need, need)) is not None
+    """Whether a record has a column that a stage may need: touch, image, background, audio, text, sensor."""
+    return getattr(record, FIELDS.get(need, need)) is not None
 
 
 def columns_of(
@@ -102,9 +101,8 @@ def columns_of(
             raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
     if config.touch_size not in (None, processor.image_size) and not all(isinstance(one, RecordSet) for one in sources):
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
-    names = material_names(sources) if "material" in needs else ()
     return [
-        decoded(cache, source, processor, needs, names, config.touch_size)
+        decoded(cache, source, processor, needs, config.touch_size)
         if isinstance(source, RecordSet)
         else drawn(cache, source, "train", processor)
         for source in sources
@@ -156,13 +154,11 @@ def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.
 
 
 def decoded(
-    cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], materials: Sequence[str] = (),
-    touch_size: int | None = None,
-) -> Rendered:  # fmt: skip
+    cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], touch_size: int | None = None
+) -> Rendered:
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
-    Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave
-    nothing in the cache.
+    Files that cannot be read are refused in a list, and leave nothing in the cache.
     """
     size, mel = processor.image_size, processor.audio
     side = touch_size or size
@@ -196,10 +192,9 @@ def decoded(
         if name in needs:
             folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
             columns[name] = mapped(folder, len(data), {"values": kind}, partial(decode, name))["values"]
-    places = [materials.index(name) if name in materials else -1 for name in data.materials]
     return Rendered(
         **columns,
-        material=np.array([places[r.labels["material"]] if "material" in r.labels else -1 for r in data.records]),
+        material=np.full(len(data), -1),
         text=[record.caption or "" for record in data.records],
         sensor=data.sensor or "",
         fingerprint=fingerprint,
@@ -221,11 +216,3 @@ def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str], unnamed: in
     """The place of each sample's sensor in `names`, int64 (N,); `unnamed` where it has none."""
     numbers = [names.index(split.sensor) if split.sensor in names else unnamed for split in splits]
     return np.repeat(numbers, [len(split) for split in splits])
-
-
-def material_names(sources: Sequence[Source]) -> tuple[str, ...]:
-    """The materials of all sources, those of one name as one."""
-    known = {source.materials for source in sources}
-    if len(known) > 1 and any(name.isdecimal() for names in known for name in names):
-        raise InvalidInputError("Materials that are numbers cannot be mixed with others; name these by `materials`.")
-    return tuple(dict.fromkeys(name for source in sources for name in source.materials))

@@ -53,7 +53,7 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     """Contacts of a data set, with what every one of its records has, decoded once into `cache`."""
     modalities = modalities_of(data)
     gel = ["background"] if all(has(record, "background") for record in data.records) else []
-    seen = decoded(cache, data, processor, ["touch", *gel, *modalities], data.materials)
+    seen = decoded(cache, data, processor, ["touch", *gel, *modalities])
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     known = {"caption": list(seen.text)} if "text" in modalities else {}

@@ -4,7 +4,7 @@
     label.json  {object: 0 to 6}         split.json  {train, val, test: [[object, point], ...]}
 
 Objects 1 to 100 are those of 1.0, touched by TACTO, and those above of 2.0, touched by Taxim. What the numbers of
-materials stand for was never published: name them with `materials`, or they stay numbers.
+materials stand for was never published: name them with `materials` of `open_dataset`, or they stay numbers.
 """
 
 import json

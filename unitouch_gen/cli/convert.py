@@ -74,9 +74,8 @@ def distill(
     Example: unitouch-gen distill --model my-pipeline -o runs/turbo
     """
     folder = folder_of(model)
-    from unitouch_gen.training.distill import DistillRecipe, main
     from unitouch_gen.training.stages import run_stage
 
     given = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume, "init": init}
-    run_stage("distill", DistillRecipe, main, model=folder, output=output, **given)
+    run_stage("distill", model=folder, output=output, **given)
     echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")

@@ -1,7 +1,6 @@
 """Data sets as the columns that stages are trained on: decoded once, refused where they are broken, mixed, split."""
 
 import json
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,12 @@ import soundfile
 import torch
 from PIL import Image
 
-from tests.helpers.data_sets import RED, shade, write_image
-from unitouch_gen.errors import InvalidInputError
+from tests.helpers.data_sets import RED, write_image
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings, material_names, open_dataset
-from unitouch_gen.training.stages import run
-from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.training.__main__ import app
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings, open_dataset
 
 
 @pytest.fixture
@@ -43,14 +41,14 @@ def columns(folder: Path, cache: Path, processor: UniTouchProcessor, *needs: str
 
 
 def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp_path, processor) -> None:
-    needs = ("image", "touch", "audio", "text", "material", "sensor")
+    needs = ("image", "touch", "audio", "text", "sensor")
     written = columns(folder, tmp_path / "cache", processor, *needs, touch_size=24)
     files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")}
     cached = columns(folder, tmp_path / "cache", processor, *needs, touch_size=24)
     assert len(files) == 6 and {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")} == files
     for one, other in zip(written, cached, strict=True):
         assert isinstance(other.touch, np.memmap) and one.fingerprint == other.fingerprint
-        for name in ("image", "touch", "audio", "material"):
+        for name in ("image", "touch", "audio"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert [(split.sensor, len(split)) for split in cached] == [("digit", 15), ("gelsight", 5)]
     smaller, split = UniTouchProcessor(image_size=24), cached[1]
@@ -65,12 +63,12 @@ def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp
 
 
 def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, processor: UniTouchProcessor) -> None:
-    before = columns(folder, tmp_path, processor, "touch", "material")[0]
+    before = columns(folder, tmp_path, processor, "touch")[0]
     table = (folder / "labels.csv").read_text()
     (folder / "labels.csv").write_text(table.replace("0.wav,digit,wood", "0.wav,digit,glass"))
-    named = columns(folder, tmp_path, processor, "touch", "material")[0]
+    named = columns(folder, tmp_path, processor, "touch")[0]
     write_image(folder / "touch3.png", RED, (48, 36))
-    after = columns(folder, tmp_path, processor, "touch", "material")[0]
+    after = columns(folder, tmp_path, processor, "touch")[0]
     assert len({before.fingerprint, named.fingerprint, after.fingerprint}) == 3
     assert np.abs(after.touch[3].reshape(3, -1).mean(axis=1) - RED).max() < 1
 
@@ -97,28 +95,15 @@ def test_broken_files_are_refused_in_a_list_and_leave_no_cache(folder, tmp_path,
     assert list((tmp_path / "cache").glob("*")) == []
 
 
-@pytest.mark.parametrize("need", ["image", "text", "material"])
+@pytest.mark.parametrize("need", ["image", "text", "audio"])
 def test_what_a_record_lacks_is_named_before_anything_is_decoded(need, folder, tmp_path, processor) -> None:
-    cells = {"image": "picture4.png", "text": "n4", "material": "glass"}
+    cells = {"image": "picture4.png", "text": "n4", "audio": "4.wav"}
     header, *rows = (folder / "labels.csv").read_text().splitlines()
     rows[4] = ",".join("" if cell == cells[need] else cell for cell in rows[4].split(","))
     (folder / "labels.csv").write_text("\n".join([header, *rows]))
     with pytest.raises(InvalidInputError, match=rf"Data set 'mine' .* has no {need} for 'touch4\.png'; this stage"):
         columns(folder, tmp_path / "cache", processor, "touch", need)
     assert not (tmp_path / "cache").exists()
-
-
-def test_materials_that_are_numbers_are_not_mixed_with_others(folder: Path, tmp_path: Path) -> None:
-    for number in range(3):
-        write_image(tmp_path / "numbered" / str(number) / "a.png", shade(number))
-    sets = [{"path": str(folder), "split": "none"}, {"path": str(tmp_path / "numbered"), "split": "none"}]
-    with pytest.raises(InvalidInputError, match=r"numbers cannot be mixed .* `materials`"):
-        material_names(DataConfig(sets=sets).sources())
-    assert material_names(DataConfig(sets=sets[1:]).sources()) == ("0", "1", "2")
-    sets[1]["materials"] = ["wood", "iron", "clay"]
-    assert material_names(DataConfig(sets=sets).sources()) == ("cork", "glass", "wood", "iron", "clay")
-    mixed = DataConfig(sets=sets, drawn={"sensors": ["digit"]}).sources()
-    assert material_names(mixed)[: len(MATERIAL_NAMES)] == MATERIAL_NAMES  # they keep their numbers
 
 
 @pytest.mark.parametrize("count", [3, 25])
@@ -142,9 +127,8 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
     settings = ["trainer.steps=2", "trainer.batch_size=4", "trainer.warmup=1", "trainer.mixed_precision=no",
                 f"data.sets=[{{path: {folder}, split: object}}]",
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
-    words = ["--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
-    module = import_module("unitouch_gen.training.touch")
-    run("touch", module.TouchRecipe, module.main, [*words, *(part for one in settings for part in ("--set", one))])
+    words = ["touch", "--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
+    run_commands(app, "unitouch_gen.training", [*words, *(part for one in settings for part in ("--set", one))])
     assert json.loads((tmp_path / "touch" / "record.json").read_text())["sets"] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))

@@ -1,0 +1,40 @@
+"""Training by its stages: `python -m unitouch_gen.training STAGE`."""
+
+import sys
+from functools import partial
+from inspect import signature
+from typing import Any
+
+import typer
+
+from unitouch_gen.errors import run_commands
+from unitouch_gen.training.assemble import assemble
+from unitouch_gen.training.stages import Recipe, Stage, run_stage
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
+
+
+def add(name: str, sentence: str) -> None:
+    """Adds the command of a stage."""
+
+    def command(**options: Any) -> None:
+        run_stage(name, **options)
+
+    command.__signature__ = signature(partial(Stage, name, Recipe))  # type: ignore[attr-defined]
+    app.command(name, help=sentence)(command)
+
+
+add("image_text", "Binds pictures and captions to each other: the joint space.")
+add("audio", "Binds sounds to pictures.")
+add("touch", "Binds touches to pictures.")
+add("image_vae", "Learns the autoencoder of pictures.")
+add("unclip", "Learns to draw pictures from embeddings of pictures.")
+add("touch_vae", "Learns the autoencoder of touches.")
+add("touch_ldm", "Learns to draw touches from embeddings of pictures.")
+add("language_model", "Learns a small language model of questions about contacts.")
+add("touch_llm", "Learns a bridge from embeddings of pictures into a language model.")
+app.command()(assemble)
+add("distill", "Learns LoRA weights by which a saved pipeline draws in four evaluations.")
+
+if __name__ == "__main__":
+    sys.exit(run_commands(app, "unitouch_gen.training", prog_name="python -m unitouch_gen.training"))
