@@ -127,7 +127,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         # 2. Encode the touch
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
         with report.stage(name):
-            encoded, embeds = self._encode(name, inputs, weights, report)
+            embeds = self._encode(name, inputs, weights, report)
 
         # 3. Generate token ids, after prompts that are padded on the left
         device, pad, width = self._execution_device, config.pad_token_id, max(report.prompt_tokens)
@@ -144,24 +144,20 @@ class TouchToTextPipeline(UniTouchPipeline):
         ends = {pad, *config.eos_token_id}
         report.tokens = [sum(1 for _ in takewhile(lambda one: one not in ends, row)) for row in answers.tolist()]
         self.maybe_free_model_hooks()
-        return TouchToTextPipelineOutput(texts, report, embeds, encoded) if return_dict else (texts, report)
+        return TouchToTextPipelineOutput(texts, report, embeds) if return_dict else (texts, report)
 
     @runs_networks
     def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        return self._encode("touch", self._prepare_touch(touch, sensor, background), None, AnswerReport())[1]
+        return self._encode("touch", self._prepare_touch(touch, sensor, background), None, AnswerReport())
 
-    def _encode(
-        self, name: str, inputs: Any, weights: Sequence[float] | None, report: AnswerReport
-    ) -> tuple[Tensor | None, Tensor]:
-        """Embeddings (B, D): of touches as encoded, and of any inputs, mixed by the weights."""
-        encoded = self._touch_embeds(inputs, report) if name == "touch" else None
-        if name == "image":
+    def _encode(self, name: str, inputs: Any, weights: Sequence[float] | None, report: AnswerReport) -> Tensor:
+        """Embeddings (B, D) of inputs, mixed by the weights."""
+        if name == "touch":
+            inputs = self._touch_embeds(inputs, report)
+        elif name == "image":
             inputs = self._match_norm(self.unitouch.get_image_features(inputs), name)
-        embeds = inputs if encoded is None else encoded
-        if weights is not None:
-            embeds = mix_to_norm(embeds[:, None], torch.tensor(weights))
-        return encoded, embeds
+        return inputs if weights is None else mix_to_norm(inputs[:, None], torch.tensor(weights))
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
