@@ -50,7 +50,7 @@ def test_logits_and_greedy_text_are_those_of_the_release(tmp_path, legacy, layou
     folder, bridge, llama, weights = published(tmp_path / "llama", legacy)
     if layout == "transformers":
         folder = in_transformers_layout(llama, tmp_path / "hf")
-    pipe = TouchToTextPipeline.from_published(bridge, folder)
+    pipe = TouchToTextPipeline(**read_touch_llm(bridge, folder))
     ids = torch.tensor(TOKENIZER(["How?"] * 2)["input_ids"])
     options = {"max_new_tokens": 6, "min_new_tokens": 6, "do_sample": False}
     with pipe.language_bridge.attach(pipe.language_model, EMBEDS):

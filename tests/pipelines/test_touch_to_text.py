@@ -41,15 +41,11 @@ def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, to
     assert texts == output.texts and "12 tokens" in str(report)
 
 
-def test_one_input_has_several_questions_or_answers_and_several_touches_are_one_input(ask, touch, photo):
+def test_one_input_has_several_questions_or_answers(ask, photo):
     several = ask(touch_embeds=EMBEDS[:1], question=[QUESTION, "Where?"], num_beams=2, num_return_sequences=2, **SHORT)
     assert len(several.texts) == 4 and several.embeds.shape == (1, D)
     assert several.texts[:2] == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2,
                                     **SHORT).texts  # fmt: skip
-    mixed = ask(touch, QUESTION, weights=[1, 3], **SHORT)
-    wanted = (torch.tensor([0.25, 0.75]) @ ask.encode_touch(touch))[None]
-    assert_close(torch.nn.functional.normalize(mixed.embeds), torch.nn.functional.normalize(wanted))
-    assert len(mixed.texts) == 1
     seen = ask(image=photo, question=QUESTION, **SHORT)
     assert_close(seen.embeds.norm(dim=1), torch.full((2,), 3.0))
 
@@ -110,8 +106,6 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("temperatur", InvalidInputError, {**two, "temperatur": 0.5}),
         ("generate", InvalidInputError, {**two, "early_stopping": "soon"}),
         ("num_beams", InvalidInputError, {**two, "num_beams": 0}),
-        ("streamer", InvalidInputError, {**two, "streamer": TextIteratorStreamer(ask.tokenizer)}),
-        ("weights", InvalidInputError, {**two, "weights": [1.0]}), ("weights", InvalidTypeError, {**two, "weights": 1}),
         ("generator", InvalidTypeError, {**two, "generator": 3}),
         ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),
         ("sensor", InvalidInputError, {"image": photo, "question": QUESTION, "sensor": "digit"}),
