@@ -31,6 +31,7 @@ from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
 CARD, PICTURES = "README.md", "pictures"
+TEMPLATE = Path(__file__).with_name("card.md")
 
 
 def name_classes(folder: Path) -> None:
@@ -87,54 +88,17 @@ class Card:
 
     def write(self, folder: Path, name: str, pipe: Any) -> None:
         """Writes README.md and its pictures; its example loads the pipeline by `name`, a folder or repository id."""
-        images = ""
+        places: dict[str, str] = {}
         for number, (caption, file) in enumerate(self.pictures.items()):
-            place = f"{PICTURES}/{number}-{Path(file).name}"
+            places[caption] = f"{PICTURES}/{number}-{Path(file).name}"
             (folder / PICTURES).mkdir(exist_ok=True)
-            shutil.copyfile(file, folder / place)
-            images += f"![{caption}]({place})\n\n*{caption}*\n\n"
-        rows = "".join(f"\n| {key} | {value} |" for key, value in self.figures.items())
-        figures = f"| figure | measured |\n|---|---|{rows}" if rows else "Not stated."
-        tags = ["unitouch_gen", "touch", "tactile"]
+            shutil.copyfile(file, folder / places[caption])
         data = ModelCardData(
-            license=self.license.lower() or None, library_name="diffusers", pipeline_tag=pipe._task, tags=tags
-        )
-        content = f"""---
-{data.to_yaml()}
----
-
-# {Path(name).name}
-
-{self.description or str(type(pipe).__doc__).splitlines()[0]}
-
-{images}## How to use it
-
-```python
-from unitouch_gen import {type(pipe).__name__}, example  # pip install unitouch_gen
-
-pipe = {type(pipe).__name__}.from_pretrained("{name}")
-output = {pipe._example_call}  # or paths of your own
-{pipe._example_end}
-print(output.report)
-```
-
-diffusers loads it, too: `DiffusionPipeline.from_pretrained("{name}", trust_remote_code=True)`. The code to be trusted
-is `pipeline.py`, which imports `unitouch_gen`.
-
-## How good it is
-
-{figures}
-
-## What it was trained on
-
-{self.data or "Not stated."}
-
-## What it cannot do
-
-{self.limits}
-
-## Licence
-
-{self.license or "Not stated: ask who made it before you use it."}
-"""
-        ModelCard(content).save(folder / CARD)
+            license=self.license.lower() or None, library_name="diffusers", pipeline_tag=pipe._task,
+            tags=["unitouch_gen", "touch", "tactile"],
+        )  # fmt: skip
+        card = ModelCard.from_template(
+            data, str(TEMPLATE), card=self, pipe=pipe, kind=type(pipe).__name__, name=name, title=Path(name).name,
+            description=self.description or str(type(pipe).__doc__).splitlines()[0], pictures=places,
+        )  # fmt: skip
+        card.save(folder / CARD)

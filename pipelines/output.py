@@ -19,13 +19,11 @@ class UniTouchPipelineOutput(BaseOutput):
             (B, C, h, w), by `output_type`; of the samples that are finite.
         report: What the call did.
         embeds: Embeddings that conditioned the network, of all samples; pass them to another call to skip encoding.
-        encoded: Touch embeddings (B, D) before the bridge, for zero-shot classification. `None` without touches.
     """
 
     images: list[Image.Image] | np.ndarray | torch.Tensor
     report: RunReport
     embeds: torch.Tensor
-    encoded: torch.Tensor | None = None
 
 
 @dataclass
@@ -48,10 +46,8 @@ class TouchToTextPipelineOutput(BaseOutput):
         texts: Answers, those of one input together.
         report: What the call did.
         embeds: Embeddings (B, D) that the answers are about; pass them to another call to skip encoding.
-        encoded: Touch embeddings (B, D) before they are mixed. `None` without touches.
     """
 
     texts: list[str]
     report: AnswerReport
     embeds: torch.Tensor
-    encoded: torch.Tensor | None = None

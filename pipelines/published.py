@@ -2,8 +2,6 @@
 
 import math
 import os
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +9,7 @@ from diffusers import StableUnCLIPImg2ImgPipeline
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPVisionModelWithProjection
 
-from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.errors import check_dtype
 from unitouch_gen.files import NEVER_READ, local_folder, reading
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
@@ -25,9 +23,9 @@ def read_joint(
     if isinstance(unitouch, UniTouchModel):
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
     folder = local_folder("unitouch", unitouch, **hub)
-    check_holds("unitouch", folder, ["config.json"], "a joint space that `unitouch-gen convert unitouch` wrote")
     dtype = check_dtype("dtype", dtype)
-    return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
+    with reading("unitouch", folder):
+        return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
 def read_unclip(
@@ -37,8 +35,6 @@ def read_unclip(
     own = "image" in model.known_modalities
     unread = [*NEVER_READ, *([] if variant else ["*.fp16.*"]), *(["image_encoder/*"] if own else [])]
     folder = local_folder("unclip", unclip, ignore_patterns=unread, **hub)
-    parts = ["image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae"]
-    check_holds("unclip", folder, parts, "a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP")
     files: dict[str, Any] = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
     with reading("unclip", folder):
         pipe = StableUnCLIPImg2ImgPipeline.from_pretrained(folder, **files, feature_extractor=None, image_encoder=None)
@@ -55,9 +51,3 @@ def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:
     """RMS norm of embeddings with mean m and standard deviation s: sqrt(sum of m^2 + s^2)."""
     mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
     return math.sqrt(float((mean.square() + std.square()).sum()))
-
-
-def check_holds(name: str, folder: Path, parts: Sequence[str], wanted: str) -> None:
-    """Raises unless a folder holds all of `parts`."""
-    if missing := [part for part in parts if not (folder / part).exists()]:
-        raise InvalidInputError(f"`{name}` is {str(folder)!r}, which holds no {', '.join(missing)}; pass {wanted}.")

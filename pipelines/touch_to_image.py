@@ -177,7 +177,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
             raise InvalidInputError("`touch` or `touch_embeds` has to be passed, one of them.")
-        encoded: Tensor | None = None
         embeds: Any = touch_embeds
         if touch is None:
             check_tensor("touch_embeds", embeds, "B", self.embedding_dim)
@@ -201,7 +200,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             report.left_out.append("touch encoder")
         else:
             with report.stage("touch"):
-                encoded, embeds = self._encode(touches, strength, bridge, report, throw)
+                embeds = self._encode(touches, strength, bridge, report, throw)
         if self.embedding_bank is not None and (touches is None or not bridge):
             report.left_out.append("embedding bank")
 
@@ -209,7 +208,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         images = self._generate(settings, embeds, noise_level, prompts, report)
         if not return_dict:
             return images, report
-        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds, encoded=encoded)
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
 
     def _generate(
         self, settings: CallSettings, embeds: Tensor, noise_level: int, prompts: list[list[str] | Tensor],
@@ -247,14 +246,12 @@ class TouchToImagePipeline(UniTouchPipeline):
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
         touches = self._prepare_touch(touch, sensor, background)
-        return self._encode(touches, strength, bridge, RunReport())[1]
+        return self._encode(touches, strength, bridge, RunReport())
 
-    def _encode(
-        self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True
-    ) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, D) of touches, first as encoded, then with bridge and strength."""
-        encoded = self._touch_embeds(touches, report, throw)
-        return encoded, strength * (self.embedding_bank.bridge(encoded) if bridge else encoded)
+    def _encode(self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
+        """Embeddings (B, D) of touches, with bridge and strength."""
+        embeds = self._touch_embeds(touches, report, throw)
+        return strength * (self.embedding_bank.bridge(embeds) if bridge else embeds)
 
     def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.

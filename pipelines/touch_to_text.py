@@ -2,19 +2,16 @@
 
 import copy
 import inspect
-import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import takewhile
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
-from unitouch_gen.conditioning import mix_to_norm
-from unitouch_gen.convert_llm import read_touch_llm
 from unitouch_gen.errors import (
     InvalidInputError,
     check_integer,
@@ -29,9 +26,8 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, check_weights, runs_networks
+from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, runs_networks
 from unitouch_gen.pipelines.output import AnswerReport, TouchToTextPipelineOutput
-from unitouch_gen.pipelines.published import read_joint
 
 QUESTION = "{question}"  # where a template has it
 
@@ -80,16 +76,15 @@ class TouchToTextPipeline(UniTouchPipeline):
     def __call__(
         self,
         touch: ImageInput = None, question: str | list[str] | None = None, max_new_tokens: int | None = None,
-        sensor: SensorNames = None, background: ImageInput = None,
-        weights: Sequence[float] | None = None, image: ImageInput = None, touch_embeds: Tensor | None = None,
-        generator: torch.Generator | None = None, return_dict: bool = True, **generate: Any,
+        sensor: SensorNames = None, background: ImageInput = None, image: ImageInput = None,
+        touch_embeds: Tensor | None = None, generator: torch.Generator | None = None, return_dict: bool = True,
+        **generate: Any,
     ) -> TouchToTextPipelineOutput | tuple:  # fmt: skip
         """Answers questions about touches. Other arguments, errors and warnings: see `TouchToImagePipeline.__call__`.
 
         Args:
             question: One question, or one for each touch; or several about a single touch.
             max_new_tokens: Most tokens of an answer; default the language model's own, or 128.
-            weights: Of several touches that are one input: answers are about their mix. Only ratios count.
             image: Photos in place of `touch`.
             generator: Seeds what is drawn, and torch's global generator stays as it was; without one, that draws.
             return_dict: Whether to return an output object rather than the tuple (texts, report).
@@ -113,21 +108,15 @@ class TouchToTextPipeline(UniTouchPipeline):
             inputs = touch_embeds if name == "touch_embeds" else self._joint(name) and self.processor.images(image)
         if name == "touch_embeds":
             check_tensor(name, inputs, "B", self.embedding_dim)
-        count = len(inputs.pixels if name == "touch" else inputs)
-        if weights is not None:
-            weights = check_weights("weights", check_kind("weights", weights, list, tuple))
-            if len(weights) != count:
-                raise InvalidInputError(f"`weights` holds {len(weights)} for {count} inputs; pass one for each.")
-            count = 1
         if generator is not None:
             check_kind("generator", generator, torch.Generator)
-        prompts = self._tokenize(question, count)
+        prompts = self._tokenize(question, len(inputs.pixels if name == "touch" else inputs))
         config, options = self._check_options(prompts, max_new_tokens, generate)
 
         # 2. Encode the touch
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
         with report.stage(name):
-            encoded, embeds = self._encode(name, inputs, weights, report)
+            embeds = self._encode(name, inputs, report)
 
         # 3. Generate token ids, after prompts that are padded on the left
         device, pad, width = self._execution_device, config.pad_token_id, max(report.prompt_tokens)
@@ -144,24 +133,18 @@ class TouchToTextPipeline(UniTouchPipeline):
         ends = {pad, *config.eos_token_id}
         report.tokens = [sum(1 for _ in takewhile(lambda one: one not in ends, row)) for row in answers.tolist()]
         self.maybe_free_model_hooks()
-        return TouchToTextPipelineOutput(texts, report, embeds, encoded) if return_dict else (texts, report)
+        return TouchToTextPipelineOutput(texts, report, embeds) if return_dict else (texts, report)
 
     @runs_networks
     def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        return self._encode("touch", self._prepare_touch(touch, sensor, background), None, AnswerReport())[1]
+        return self._encode("touch", self._prepare_touch(touch, sensor, background), AnswerReport())
 
-    def _encode(
-        self, name: str, inputs: Any, weights: Sequence[float] | None, report: AnswerReport
-    ) -> tuple[Tensor | None, Tensor]:
-        """Embeddings (B, D): of touches as encoded, and of any inputs, mixed by the weights."""
-        encoded = self._touch_embeds(inputs, report) if name == "touch" else None
-        if name == "image":
-            inputs = self._match_norm(self.unitouch.get_image_features(inputs), name)
-        embeds = inputs if encoded is None else encoded
-        if weights is not None:
-            embeds = mix_to_norm(embeds[:, None], torch.tensor(weights))
-        return encoded, embeds
+    def _encode(self, name: str, inputs: Any, report: AnswerReport) -> Tensor:
+        """Embeddings (B, D) of touches, of photos, or as they were passed."""
+        if name == "touch":
+            return self._touch_embeds(inputs, report)
+        return self._match_norm(self.unitouch.get_image_features(inputs), name) if name == "image" else inputs
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
@@ -191,8 +174,6 @@ class TouchToTextPipeline(UniTouchPipeline):
         known -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are ours to say
         for name in given.keys() - known:
             raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
-        if given.get("streamer") is not None and len(prompts) > 1:
-            raise InvalidInputError(f"`streamer` is for one answer, not for {len(prompts)}; leave it out.")
         for name in ("num_beams", "num_return_sequences"):
             check_integer(name, given.get(name, 1), 1)
         with usable(given):
@@ -202,17 +183,6 @@ class TouchToTextPipeline(UniTouchPipeline):
         pads = (config.pad_token_id, tokenizer.pad_token_id, config.eos_token_id[0])
         config.pad_token_id = next(one for one in pads if one is not None)
         return config, others
-
-    @classmethod
-    def from_published(
-        cls, bridge: str | os.PathLike, llama: str | os.PathLike, unitouch: str | os.PathLike | None = None,
-        *, dtype: torch.dtype = torch.float32,
-    ) -> Self:  # fmt: skip
-        """Builds on Touch-LLM's published `bridge` and a `llama`, see `read_touch_llm`, and a converted joint space."""
-        parts = read_touch_llm(bridge, llama, dtype=dtype)
-        if unitouch is not None:
-            parts["unitouch"], parts["processor"] = read_joint(unitouch, dtype)
-        return cls(**parts)
 
 
 @contextmanager

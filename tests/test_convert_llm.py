@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 from torch.testing import assert_close
-from transformers import LlamaConfig, LlamaForCausalLM
 
 from tests.helpers.components import make_language_parts
-from tests.helpers.touch_llm import DIM, HEADS, HIDDEN, LAYERS, WIDTH, files_of, logits_of
+from tests.helpers.touch_llm import DIM, WIDTH, files_of, logits_of
 from unitouch_gen.convert_llm import read_touch_llm
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TouchToTextPipeline
@@ -25,32 +24,11 @@ def published(folder: Path, legacy: bool = False):
     return folder, folder.with_suffix(".pth"), *files_of(folder, len(TOKENIZER), legacy)
 
 
-NAMES = {"tok_embeddings": "model.embed_tokens", "output": "lm_head", "layers": "model.layers", "norm": "model.norm",
-         "attention_norm": "input_layernorm", "ffn_norm": "post_attention_layernorm", "attention": "self_attn",
-         "feed_forward": "mlp", "w1": "gate_proj", "w2": "down_proj", "w3": "up_proj",
-         **{f"w{one}": f"{one}_proj" for one in "qkvo"}}  # fmt: skip
-
-
-def in_transformers_layout(llama: dict, place: Path) -> Path:
-    """The LLaMA alone, permuted as transformers' own script does."""
-    sizes = {"hidden_size": DIM, "intermediate_size": HIDDEN, "num_hidden_layers": LAYERS, "num_attention_heads": HEADS}
-    model = LlamaForCausalLM(LlamaConfig(**sizes, vocab_size=len(TOKENIZER), rms_norm_eps=1e-5))
-    state = {".".join(NAMES.get(part, part) for part in key.split(".")): value for key, value in llama.items()}
-    for key in [key for key in state if "q_proj" in key or "k_proj" in key]:
-        state[key] = state[key].view(HEADS, DIM // HEADS // 2, 2, DIM).transpose(1, 2).reshape(DIM, DIM)
-    model.load_state_dict(state)
-    model.save_pretrained(place)
-    TOKENIZER.save_pretrained(place)
-    return place
-
-
-@pytest.mark.parametrize(("legacy", "layout"), [(False, "original"), (True, "original"), (False, "transformers")])
+@pytest.mark.parametrize("legacy", [False, True])
 @torch.no_grad()
-def test_logits_and_greedy_text_are_those_of_the_release(tmp_path, legacy, layout):
+def test_logits_and_greedy_text_are_those_of_the_release(tmp_path, legacy):
     folder, bridge, llama, weights = published(tmp_path / "llama", legacy)
-    if layout == "transformers":
-        folder = in_transformers_layout(llama, tmp_path / "hf")
-    pipe = TouchToTextPipeline.from_published(bridge, folder)
+    pipe = TouchToTextPipeline(**read_touch_llm(bridge, folder))
     ids = torch.tensor(TOKENIZER(["How?"] * 2)["input_ids"])
     options = {"max_new_tokens": 6, "min_new_tokens": 6, "do_sample": False}
     with pipe.language_bridge.attach(pipe.language_model, EMBEDS):
@@ -88,9 +66,9 @@ def test_another_checkpoint_is_refused_and_no_pickle_is_run(tmp_path, monkeypatc
     assert not Path("ran").exists()
 
 
-def test_a_folder_without_one_llama_is_refused(tmp_path):
+def test_a_folder_without_a_llama_in_transformers_layout_is_refused(tmp_path):
     folder, bridge, *_ = published(tmp_path / "llama")
-    torch.save({}, folder / "consolidated.01.pth")
+    (folder / "config.json").rename(folder / "params.json")
     for place in (folder, tmp_path):
-        with pytest.raises(InvalidInputError, match=f"`llama` is '{re.escape(str(place))}'"):
+        with pytest.raises(InvalidInputError, match=f"`llama` is '{re.escape(str(place))}', .* transformers' layout"):
             read_touch_llm(bridge, place)

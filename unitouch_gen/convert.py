@@ -12,8 +12,9 @@ import pickle
 import re
 import zipfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -31,26 +32,19 @@ FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 
 # The layout -----------------------------------------------------------------------------------------------------------
 
-Shape = tuple[int, ...]
+Rule = Callable[[Tensor], Tensor]
+"""Makes one of our tensors of a published one."""
 
-
-class Rule(NamedTuple):
-    """How a published tensor becomes one of ours."""
-
-    shape: Callable[[Shape], Shape]  # of the published tensor, from that of ours
-    make: Callable[[Tensor], Tensor]  # ours, from the published one
+SAME: Rule = torch.as_tensor
+WITHOUT_BATCH: Rule = partial(torch.squeeze, dim=0)
+STILL: Rule = partial(torch.sum, dim=2)
+"""A still picture is two equal frames to a stem over two, so that its kernel is the sum over time."""
 
 
 def third(number: int) -> Rule:
     """One of query, key and value, which are stacked."""
-    return Rule(lambda shape: (3 * shape[0], *shape[1:]), lambda stacked: stacked.chunk(3)[number])
+    return lambda stacked: stacked.chunk(3)[number]
 
-
-SAME = Rule(lambda shape: shape, lambda tensor: tensor)
-WITHOUT_BATCH = Rule(lambda shape: (1, *shape), lambda tensor: tensor[0])
-WITHOUT_BATCH_AND_LENGTH = Rule(lambda shape: (1, 1, *shape), lambda tensor: tensor[0, 0])
-STILL = Rule(lambda shape: (*shape[:2], 2, *shape[2:]), lambda kernel: kernel.sum(dim=2))
-"""A still picture is two equal frames to a stem over two, so that its kernel is the sum over time."""
 
 _END = r"\.(weight|bias)"
 _BLOCK = r"blocks\.(\d+)"
@@ -86,7 +80,7 @@ _POSITIONS = r"embeddings\.position_embedding\.weight"
 
 RENAMINGS: dict[str, tuple[Renaming, ...]] = {
     "image": (
-        (r"embeddings\.class_embedding", r"modality_preprocessors.M.cls_token", WITHOUT_BATCH_AND_LENGTH),
+        (r"embeddings\.class_embedding", r"modality_preprocessors.M.cls_token", torch.Tensor.flatten),
         (r"embeddings\.patch_embedding\.weight", r"modality_preprocessors.M.rgbt_stem.proj.1.weight", STILL),
         (_POSITIONS, r"modality_preprocessors.M.pos_embedding_helper.pos_embed", WITHOUT_BATCH),
         (rf"pre_layrnorm{_END}", r"modality_trunks.M.pre_transformer_layer.0.\1", SAME),
@@ -119,60 +113,39 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
-def read_published(
-    touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None, *,
-    config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
-) -> UniTouchModel:  # fmt: skip
-    """A joint space of the published checkpoints.
-
-    Args:
-        touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
-        imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are read.
-        config: Sizes of encoders other than the published ones, without sensors.
-        dtype: Precision of the weights; the file's own when left out.
-
-    Raises:
-        InvalidInputError: If neither file is given, or one is none of these, lacks tensors, or holds some that are
-            not finite.
-    """
-    config = UniTouchConfig() if config is None else copy.deepcopy(check_kind("config", config, UniTouchConfig))
-    if touch is None and imagebind is None:
-        raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
-    if config.sensors:
-        raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
-    wanted = None if dtype is None else check_dtype("dtype", dtype)
+def _read_published(
+    files: Mapping[str, str | os.PathLike | None], config: UniTouchConfig, dtype: torch.dtype | None
+) -> UniTouchModel:
+    """A joint space of the published `FILES`, which are named by the arguments of `convert_published`."""
     model: Any = UniTouchModel(config, modalities=()).eval()
-    for name, path in (("imagebind", imagebind), ("touch", touch)):
-        if path is None:
+    for name, file in files.items():
+        if file is None:
             continue
-        path = as_path(name, path)
-        keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, path).items()}
+        model.source = as_path(name, file)
+        keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, model.source).items()}
         for modality in FILES[name]:
-            tensors = _encoder_in(f"`{name}` names {str(path)!r}, which", keys, config, modality)
+            tensors = _encoder_in(f"`{name}` names {str(file)!r}, which", keys, config, modality)
             if not model.loaded_modalities:
-                model.to(wanted or next(iter(tensors.values())).dtype)
+                model.to(dtype or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
     return model
 
 
 def _encoder_in(subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str) -> dict[str, Tensor]:
     """The tensors of a modality in a published file of tensors `keys`, by our keys; `subject` begins messages."""
-    found, wrong = {}, []
+    found, prefix = {}, MODULES[modality][0]
     with torch.device("meta"):
-        encoder = make_modules(config, modality)[MODULES[modality][0]]
-        shapes = {key: tuple(tensor.shape) for key, tensor in encoder.state_dict().items()}
-    for key, shape in shapes.items():
+        encoder = make_modules(config, modality)[prefix]
+    for key in encoder.state_dict():
         source, rule = published_name(modality, key)
-        if source not in keys or tuple(keys[source].shape) != rule.shape(shape):
-            there = tuple(keys[source].shape) if source in keys else "missing"
-            wrong.append(f"{source} is {there} instead of {rule.shape(shape)}")
-        else:
-            found[f"{MODULES[modality][0]}.{key}"] = rule.make(check_finite(source, keys[source]))
-    if wrong:
-        raise InvalidInputError(
-            f"{subject} is not laid out as the published {modality} encoder: {wrong[0]}, and {len(wrong) - 1} more "
-            "like it. `touch` is for UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
-        )
+        try:
+            found[f"{prefix}.{key}"] = rule(check_finite(source, keys[source]))
+        except (KeyError, IndexError, RuntimeError) as error:  # the last two of too few dimensions
+            wrong = f"of the shape {tuple(keys[source].shape)}" if source in keys else "missing"
+            raise InvalidInputError(
+                f"{subject} is not laid out as the published {modality} encoder: {source} is {wrong}. `touch` is for "
+                "UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
+            ) from error
     if modality == "touch":  # and a bank of no sensors
         bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
         found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
@@ -246,19 +219,28 @@ def convert_published(
 
     Args:
         output: The folder.
-        touch, imagebind, config, dtype: See `read_published`.
+        touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
+        imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are read.
         tokenizer: Folder of the tokenizer of text: OpenCLIP's, as in Stable Diffusion 2.1 unCLIP.
+        config: Sizes of encoders other than the published ones, without sensors.
+        dtype: Precision of the weights; the file's own when left out.
 
     Returns:
         What the folder lacks, in words.
 
     Raises:
-        InvalidInputError: See `read_published`; or if the output holds something else or cannot be written to. Nothing
-            is changed then.
+        InvalidInputError: If neither file is given, or one is none of these, lacks tensors, or holds some that are
+            not finite; or if the output holds something else or cannot be written to. Nothing is changed then.
     """
     output = as_path("output", output)
+    config = check_kind("config", UniTouchConfig() if config is None else copy.deepcopy(config), UniTouchConfig)
+    if touch is None and imagebind is None:
+        raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
+    if config.sensors:
+        raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
+    wanted = None if dtype is None else check_dtype("dtype", dtype)
     words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
-    model = read_published(touch, imagebind, config=config, dtype=dtype)
+    model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]

@@ -6,7 +6,6 @@ merged into a LLaMA in transformers' layout here.
 
 import os
 import re
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM
 
 from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import InvalidInputError, check_dtype
-from unitouch_gen.files import local_folder, read_settings, reading
+from unitouch_gen.files import local_folder, reading
 from unitouch_gen.models.language import LanguageBridge
 
 OUTER = {"model.embed_tokens": "tok_embeddings", "model.norm": "norm", "lm_head": "output"}
@@ -32,7 +31,6 @@ PROMPT = (
 )
 SAMPLING = {"do_sample": True, "temperature": 0.1, "top_p": 0.75, "max_new_tokens": 256}
 POSITIONS = 512  # that it was fine-tuned on
-BIASES: dict[str, Any] = {"attention_bias": True, "mlp_bias": True}  # which a LLaMA has not
 
 
 @torch.no_grad()
@@ -41,20 +39,18 @@ def read_touch_llm(
 ) -> dict[str, Any]:
     """Arguments for a `TouchToTextPipeline`: Touch-LLM's checkpoint over the LLaMA that it was trained on.
 
-    `llama` is a folder in transformers' layout, or in that of its authors: params.json and one *.pth, beside a
-    tokenizer that transformers reads. Raises `InvalidInputError` if a file cannot be read, or they do not fit.
+    `llama` is a folder or repository in transformers' layout, with its tokenizer. Raises `InvalidInputError` if a file
+    cannot be read, or they do not fit.
     """
     dtype, folder = check_dtype("dtype", dtype), local_folder("llama", llama)
+    if not (folder / "config.json").is_file():
+        raise InvalidInputError(f"`llama` is {str(folder)!r}, which has no config.json; pass transformers' layout.")
     tensors = open_checkpoint("bridge", bridge)
     model: Any
     with reading("llama", folder):
         tokenizer = AutoTokenizer.from_pretrained(folder)
-        if (folder / "params.json").is_file():
-            model, base = original_llama(folder)
-            tensors = base | tensors
-        else:
-            config = LlamaConfig.from_pretrained(folder, **BIASES)
-            model = LlamaForCausalLM.from_pretrained(folder, config=config, dtype=dtype, use_safetensors=True)
+        config = LlamaConfig.from_pretrained(folder, attention_bias=True, mlp_bias=True)  # which a LLaMA has not
+        model = LlamaForCausalLM.from_pretrained(folder, config=config, dtype=dtype, use_safetensors=True)
     try:
         made = bridge_of(tensors, model.config.num_hidden_layers)
         lay_over(model, tensors)
@@ -65,20 +61,6 @@ def read_touch_llm(
     model.generation_config.update(**SAMPLING)
     parts = {"language_bridge": made.to(dtype).eval(), "language_model": model.to(dtype=dtype).eval()}
     return {**parts, "tokenizer": tokenizer, "prompt_template": PROMPT}
-
-
-def original_llama(folder: Path) -> tuple[LlamaForCausalLM, dict[str, Tensor]]:
-    """A LLaMA as large as its authors' in a folder, and that one's weights."""
-    params, files = read_settings("llama", folder / "params.json"), [*folder.glob("*.pth")]
-    if len(files) != 1:
-        raise InvalidInputError(f"`llama` is {str(folder)!r}, with {len(files)} *.pth; pass transformers' layout.")
-    base = {f"llama.{key}": tensor for key, tensor in open_checkpoint("llama", files[0]).items()}
-    config = LlamaConfig(
-        hidden_size=params["dim"], num_hidden_layers=params["n_layers"], num_attention_heads=params["n_heads"],
-        rms_norm_eps=params["norm_eps"], intermediate_size=len(base["llama.layers.0.feed_forward.w1.weight"]),
-        vocab_size=len(base["llama.tok_embeddings.weight"]), **BIASES,
-    )  # fmt: skip
-    return LlamaForCausalLM(config), base
 
 
 def bridge_of(tensors: dict[str, Tensor], layers: int) -> LanguageBridge:

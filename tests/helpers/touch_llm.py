@@ -1,21 +1,25 @@
 """Touch-LLM's release at small width, transcribed: a LLaMA of Meta's with adapters, and its files."""
 
-import json
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from transformers import LlamaConfig, LlamaForCausalLM
 
 DIM, HEADS, LAYERS, HIDDEN, WIDTH, RANK = 32, 4, 2, 48, 16, 3
 SHAPES = {"attention.wq": (DIM, DIM), "attention.wk": (DIM, DIM), "attention.wv": (DIM, DIM),
           "attention.wo": (DIM, DIM), "feed_forward.w1": (HIDDEN, DIM), "feed_forward.w2": (DIM, HIDDEN),
           "feed_forward.w3": (HIDDEN, DIM)}  # fmt: skip
 BIASED = ("wq", "wo", "w1", "w2", "w3")
+NAMES = {"tok_embeddings": "model.embed_tokens", "output": "lm_head", "layers": "model.layers", "norm": "model.norm",
+         "attention_norm": "input_layernorm", "ffn_norm": "post_attention_layernorm", "attention": "self_attn",
+         "feed_forward": "mlp", "w1": "gate_proj", "w2": "down_proj", "w3": "up_proj",
+         **{f"w{one}": f"{one}_proj" for one in "qkvo"}}  # fmt: skip
 
 
 def files_of(folder: Path, vocabulary: int, legacy: bool) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Writes a LLaMA and a checkpoint in the published layouts; returns the weights of both."""
+    """Writes a LLaMA in transformers' layout and a checkpoint; returns the weights of both in their authors'."""
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int, scale: float = 0.3) -> Tensor:
@@ -46,11 +50,20 @@ def files_of(folder: Path, vocabulary: int, legacy: bool) -> tuple[dict[str, Ten
             llama[f"layers.{layer}.{name}.weight"] = 1 + random(DIM)
             bridge[f"llama.layers.{layer}.{name}.weight"] = 1 + random(DIM)
         bridge[f"llama.layers.{layer}.attention.gate"] = random(1, HEADS, 1, 1, scale=1.0)
-    params = {"dim": DIM, "n_heads": HEADS, "n_layers": LAYERS, "norm_eps": 1e-5, "multiple_of": 16, "vocab_size": -1}
-    (folder / "params.json").write_text(json.dumps(params))
-    torch.save(llama, folder / "consolidated.00.pth")
+    write_llama(folder, vocabulary, llama)
     torch.save({"model": bridge, "config": {"w_lora": True}}, folder.with_suffix(".pth"))
     return llama, bridge
+
+
+def write_llama(folder: Path, vocabulary: int, llama: dict[str, Tensor]) -> None:
+    """Permuted as transformers' own script does."""
+    sizes = {"hidden_size": DIM, "intermediate_size": HIDDEN, "num_hidden_layers": LAYERS, "num_attention_heads": HEADS}
+    model = LlamaForCausalLM(LlamaConfig(**sizes, vocab_size=vocabulary, rms_norm_eps=1e-5))
+    state = {".".join(NAMES.get(part, part) for part in key.split(".")): value for key, value in llama.items()}
+    for key in [key for key in state if "q_proj" in key or "k_proj" in key]:
+        state[key] = state[key].view(HEADS, DIM // HEADS // 2, 2, DIM).transpose(1, 2).reshape(DIM, DIM)
+    model.load_state_dict(state)
+    model.save_pretrained(folder)
 
 
 def rms(x: Tensor, weight: Tensor, eps: float) -> Tensor:

@@ -52,10 +52,15 @@ def touch_llm(
 
     Example: unitouch-gen convert touch-llm --bridge checkpoint.pth --llama llama-7b --unitouch unitouch -o touch-llm
     """
+    from unitouch_gen.convert_llm import read_touch_llm
     from unitouch_gen.pipelines import TouchToTextPipeline
+    from unitouch_gen.pipelines.published import read_joint
 
     kind = check_dtype("--dtype", dtype)
-    TouchToTextPipeline.from_published(bridge, llama, unitouch, dtype=kind).save_pretrained(output)
+    parts = read_touch_llm(bridge, llama, dtype=kind)
+    if unitouch is not None:
+        parts["unitouch"], parts["processor"] = read_joint(unitouch, kind)
+    TouchToTextPipeline(**parts).save_pretrained(output)
     echo("Licence: CC-BY-NC-4.0, as UniTouch's, and LLaMA's own; not for commercial use")
     echo(f"The pipeline is in {output.resolve()}")
 

@@ -59,7 +59,7 @@ def tab(pipe: Any, kind: str) -> None:
     def run(given: dict[Any, Any], progress: gradio.Progress = bar) -> tuple[Any, ...]:
         values = {name: given[part] for name, part in fields.items() if given[part] not in (None, "")}
         try:
-            return answer(pipe, values, progress)
+            return answer(pipe, kind, values, progress)
         except (ValueError, TypeError, ArithmeticError) as error:
             message = first_line(error)
             for value in values.values():  # uploads by their names
@@ -138,9 +138,9 @@ def solver_fields(pipe: Any) -> Fields:
         }
 
 
-def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
+def answer(pipe: Any, kind: str, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
     """Pictures or the answer, what the touch feels like, the run report and the seed."""
-    if "question" in given:
+    if kind == "touch-to-text":
         output = pipe(**given)
         return output.texts[0], "", str(output.report), ""
     seed = int(given.pop("seed", random.randrange(2**31)))
@@ -153,7 +153,7 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
 
     generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
     output, felt = pipe(**given, generator=generator, callback_on_step_end=show), ""
-    if output.encoded is not None and pipe.processor.tokenizer is not None:  # or the joint space reads no words
+    if kind == "touch-to-image" and pipe.processor.tokenizer is not None:  # or the joint space reads no words
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
-        felt = str(classifier.name(output.encoded[:1], "touch")[0])
+        felt = str(classifier(given["touch"], sensor=given.get("sensor"), top=3)[0])
     return output.images, felt, str(output.report), str(seed)

@@ -1,4 +1,4 @@
-"""Zero-shot classification: embeddings of any modality against the text of each class (Section 4.2 of the paper).
+"""Zero-shot classification: touches against the text of each class (Section 4.2 of the paper).
 
 Probabilities are a softmax over cosines at the temperature of training (Eq. 1), which is not calibrated: how sure they
 seem is not how often they are right.
@@ -94,24 +94,9 @@ class ZeroShotTouchClassifier:
         pixels = self.processor.touch(touch).to(self.model.device)
         matches = self.model.match_sensors(pixels, sensor)
         features, unknown = self.model.encode_touches(pixels, self.model.sensor_ids(matches))
-        return self.name(features, "touch", names, template, top=top, unknown=unknown)
-
-    @torch.no_grad()
-    def name(
-        self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None, *,
-        top: int | None = 3, unknown: Sequence[str | None] = (),
-    ) -> list[Named]:  # fmt: skip
-        """The labels of embeddings with their probabilities, best first.
-
-        Args:
-            features: (B, D), of any length.
-            modality: That they came from; its template is used.
-            labels, template, top: See `__call__`.
-            unknown: The second output of `UniTouchModel.encode_touches`: why each is out of distribution, or `None`.
-        """
-        texts = [(template or PROMPTS[modality]).format(label) for label in labels]
-        cosines = F.normalize(features.float(), dim=-1) @ text_embeddings(self.model, self.processor, texts).T
+        texts = text_embeddings(self.model, self.processor, [template.format(name) for name in names])
+        cosines = F.normalize(features.float(), dim=-1) @ texts.T
         shares = (cosines / self.model.config.temperature).softmax(dim=1)
-        best = shares.topk(min(top or len(labels), len(labels)))
-        rows = zip(best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True)
-        return [Named({labels[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]
+        best = shares.topk(min(top or len(names), len(names)))
+        rows = zip(best.indices.tolist(), best.values.tolist(), unknown, strict=True)
+        return [Named({names[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]

@@ -220,7 +220,7 @@ class UniTouchModel(PreTrainedModel):
             except RuntimeError as error:
                 wrong = str(error).splitlines()[1].strip()[:300]  # torch names every key
                 raise InvalidInputError(
-                    f"`{self.source}` does not hold the {modality} encoder that its config.json describes: {wrong}"
+                    f"`{self.source}` does not hold the {modality} encoder that its config describes: {wrong}"
                 ) from error
             for part in module.modules():
                 positions = getattr(part, "position_ids", None)  # of transformers' embeddings; no file holds them
