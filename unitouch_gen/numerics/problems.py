@@ -16,9 +16,10 @@ import torch
 from diffusers import DDIMScheduler
 from torch import Tensor
 
-from unitouch_gen.numerics.reference import solve_flow, solve_reference
+from unitouch_gen.numerics.reference import solve_flow
 from unitouch_gen.sampling import Guidance, Network, RunReport, prepare_steps, sample
 from unitouch_gen.schedule import NoiseSchedule, alpha
+from unitouch_gen.solvers import MIN_LEVEL_RATIO, denoised_at_zero
 
 STABLE_DIFFUSION: dict[str, Any] = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
@@ -111,12 +112,14 @@ class Problem:
         return predict
 
     def run(
-        self, noise: Tensor, solver: str | None = None, network: Network | None = None, throw: bool = True, **steps: Any
-    ) -> tuple[Tensor, RunReport]:
+        self, noise: Tensor, solver: str | None = None, network: Network | None = None, scheduler: Any = None,
+        throw: bool = True, **steps: Any,
+    ) -> tuple[Tensor, RunReport]:  # fmt: skip
         """Latents and report of one run from unit-variance noise; `steps` are arguments of `prepare_steps`."""
         report, network = RunReport(), network or self.network(len(noise))
-        made = prepare_steps(self.scheduler(), solver=solver, **steps)
-        return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
+        made = prepare_steps(scheduler or self.scheduler(), solver=solver, **steps)
+        with report.stage("denoising"):
+            return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
 
     def path(self, noise: Tensor, sigmas: list[float]) -> list[Tensor]:
         """Where the exact flow is at falling noise levels, (B, 4, h, h) float64 each.
@@ -127,16 +130,18 @@ class Problem:
         start = noise.double() * math.hypot(1.0, first)
         if not self.is_gaussian or self.guidance.active:
             lower = [sigma for sigma in sigmas if sigma < 0.999999 * first]
-            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-9)[-len(sigmas) :]
+            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-10)[-len(sigmas) :]
         mean, variance = (values[0].view(self.shape) for values in (self.data.means, self.data.variances))
         return [mean + ((variance + sigma**2) / (variance + first**2)).sqrt() * (start - mean) for sigma in sigmas]
 
     def solution(self, noise: Tensor) -> Tensor:
-        """Where the exact flow ends."""
+        """Where the exact flow ends; D is continued from its last levels to sigma = 0 as solvers do it."""
         if self.is_gaussian and not self.guidance.active:
             return self.path(noise, [0.0])[0]
         last = min(1e-4 * self.smallest_deviation, self.schedule.sigma_min)
-        return solve_reference(self.denoise, noise, self.schedule, rtol=1e-9, last=last)[0]
+        ends = [MIN_LEVEL_RATIO * last, last]
+        states = zip(ends, self.path(noise, ends), strict=True)
+        return denoised_at_zero([(sigma, self.denoise(x, sigma)) for sigma, x in states])
 
 
 # The problems by name -------------------------------------------------------------------------------------------------

@@ -17,8 +17,8 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError
-from unitouch_gen.schedule import NoiseSchedule, alpha
-from unitouch_gen.solvers import MIN_LEVEL_RATIO, Denoise, denoised_at_zero
+from unitouch_gen.schedule import alpha
+from unitouch_gen.solvers import Denoise
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
@@ -58,29 +58,3 @@ def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float
     if not found.success:
         raise NotConvergedError(f"The reference stopped after {evaluations} evaluations: {found.message}")
     return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(found.y.T, sigmas, strict=True)]
-
-
-def solve_reference(
-    denoise: Denoise, noise: Tensor, schedule: NoiseSchedule, rtol: float, last: float | None = None
-) -> tuple[Tensor, Tensor]:
-    """Where the flow ends from unit-variance noise, and how far that can be trusted.
-
-    Args:
-        denoise, rtol: See `solve_flow`. A trained network changes with every timestep, so that tolerances below
-            1e-5 take thousands of evaluations.
-        noise: (B, C, h, w).
-        schedule: Whose largest level is the start.
-        last: Smallest noise level, from which D is continued to sigma = 0 as solvers do it; the schedule's if left out.
-
-    Returns:
-        The solution at a tenth of the tolerance, float64 (B, C, h, w), and the relative RMS distance of the one at the
-        tolerance to it, (B,): a bound of the reference's own error.
-    """
-    last = schedule.sigma_min if last is None else last
-    ends, found = [MIN_LEVEL_RATIO * last, last], []
-    for tolerance in (rtol, 0.1 * rtol):
-        start = noise.double() * math.hypot(1.0, schedule.sigma_max)
-        states = solve_flow(denoise, start, [schedule.sigma_max, *ends], tolerance)[1:]
-        found.append(denoised_at_zero([(sigma, denoise(x, sigma)) for sigma, x in zip(ends, states, strict=True)]))
-    coarse, fine = found
-    return fine, relative_rms(coarse, fine)
