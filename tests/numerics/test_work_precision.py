@@ -14,8 +14,7 @@ from PIL import Image
 
 from tests.helpers.components import make_pipelines
 from unitouch_gen.numerics import work_precision
-from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
-from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION, relative_rms
 from unitouch_gen.numerics.work_precision import measure, pareto_front, pipeline_target, problem_target
 
 PROBLEM = PROBLEMS["gaussian"]

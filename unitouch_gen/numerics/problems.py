@@ -1,4 +1,4 @@
-"""Problems whose flow is known: Gaussian mixtures with their best denoisers, and a set of them by name.
+"""Problems whose flow is known: Gaussian mixtures with their best denoisers, their flows, and a set of them by name.
 
 Given x = x_0 + sigma n, the best prediction of data x_0 ~ sum_k N(m_k, diag v_k) / K is a mean of linear ones, each
 weighted by how probable its component is. All of it is computed in float64. Latents have four channels, as those of
@@ -7,19 +7,21 @@ alike, so that Gaussians along the pixels stand for those along any.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from diffusers import DDIMScheduler
+from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from unitouch_gen.numerics.reference import solve_flow
+from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.sampling import Guidance, Network, RunReport, prepare_steps, sample
 from unitouch_gen.schedule import NoiseSchedule, alpha
-from unitouch_gen.solvers import MIN_LEVEL_RATIO, denoised_at_zero
+from unitouch_gen.solvers import MIN_LEVEL_RATIO, Denoise, denoised_at_zero
 
 STABLE_DIFFUSION: dict[str, Any] = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
@@ -142,6 +144,45 @@ class Problem:
         ends = [MIN_LEVEL_RATIO * last, last]
         states = zip(ends, self.path(noise, ends), strict=True)
         return denoised_at_zero([(sigma, self.denoise(x, sigma)) for sigma, x in states])
+
+
+def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
+    """Root-mean-square distance of each sample (B, ...) to the truth, over the truth's own size, float64 (B,)."""
+    truth = truth.double().flatten(1)
+    return (value.double().flatten(1) - truth).norm(dim=1) / truth.norm(dim=1)
+
+
+def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float) -> list[Tensor]:
+    """x at each of falling noise levels, (B, C, h, w) float64, from x at the first of them.
+
+    By scipy's DOP853, an explicit Runge-Kutta method of order 8, in u = log sigma, where the linear part of the flow
+    has rates between 0 and 1 however ill-conditioned the data is. The state is z = alpha x, whose root mean square
+    stays near 1 along the path,
+
+        dz/du = alpha^2 z - alpha D(z / alpha, sigma),
+
+    so one tolerance serves as the relative and the absolute one.
+
+    Args:
+        denoise: D(x, sigma) of float64 states.
+        rtol: Tolerance of a step, relative to the RMS of each sample, from 1e-12.
+
+    Raises:
+        NotConvergedError: If no step is small enough.
+    """
+
+    def slope(u: float, z: np.ndarray) -> np.ndarray:
+        sigma = math.exp(u)
+        denoised = denoise(torch.from_numpy(z.reshape(x.shape)) / alpha(sigma), sigma)
+        return alpha(sigma) ** 2 * z - alpha(sigma) * denoised.numpy().reshape(-1)
+
+    levels, start = [math.log(sigma) for sigma in sigmas], (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
+    # Its norm is over the whole batch: divided by sqrt(B), no sample errs by more, even if all of the error is its own.
+    tolerance = max(rtol / math.sqrt(len(x)), 1e-13)
+    found = solve_ivp(slope, (levels[0], levels[-1]), start, "DOP853", levels, rtol=tolerance, atol=tolerance)
+    if not found.success:
+        raise NotConvergedError(f"The reference stopped after {found.nfev} evaluations: {found.message}")
+    return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(found.y.T, sigmas, strict=True)]
 
 
 # The problems by name -------------------------------------------------------------------------------------------------

@@ -23,8 +23,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning, first_line
 from unitouch_gen.files import write_file
-from unitouch_gen.numerics.problems import Problem
-from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.problems import Problem, relative_rms
 from unitouch_gen.sampling import SOLVERS, RunReport
 from unitouch_gen.schedule import TRAINED
 
@@ -86,7 +85,7 @@ def pipeline_target(
 ) -> Target:  # fmt: skip
     """Calls of a pipeline under conditions, from some noises each.
 
-    The reference is 400 steps of UniPC; what 200 differ from it bounds its own error. A trained network ripples with
+    The reference is 400 steps of UniPC, its own error the distance of 200 steps to it. A trained network ripples with
     the waves of the timestep's embedding, by about one percent over some ten levels, and tolerances far below that
     follow every ripple.
 
