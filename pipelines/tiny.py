@@ -1,5 +1,6 @@
 """Pipelines of the built-in tiny family; components they share are stored once."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -96,25 +97,26 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
                 "tokenizer": processor.tokenizer,
                 "text_encoder": joint.text_model.text_model.eval(),
             }
-        if name in TURBO:
-            parts["scheduler"] = LCMScheduler.from_config(parts["scheduler"].config)
-            parts |= read_settings("family", folder / "turbo" / "defaults.json")
-            with_lora(parts["unet"], folder / "turbo")
         pipe = kind(**parts)
+        if name in TURBO:
+            pipe = distilled(pipe, folder / "turbo")
         pipe._card = _card(family, name)
     return pipe
 
 
-def with_lora(unet: UNet2DConditionModel, folder: Path) -> UNet2DConditionModel:
-    """Fuses LoRA weights into a network, in place, and returns it."""
+def distilled(pipe: Any, folder: Path) -> Any:
+    """A copy of a pipeline with LoRA weights of `unitouch-gen distill` fused into its UNet, and their defaults."""
     needed("peft")
+    made, unet = copy.copy(pipe), copy.deepcopy(pipe.unet)
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
     unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)
     if not getattr(unet, "peft_config", None):
         raise InvalidInputError(f"{str(folder)!r} holds no LoRA weights of a UNet.")
     unet.fuse_lora()
     unet.unload_lora()
-    return unet
+    made.unet, made.scheduler = unet, LCMScheduler.from_config(pipe.scheduler.config)
+    made.register_to_config(**read_settings("folder", folder / "defaults.json"))
+    return made
 
 
 def joint_space(

@@ -91,15 +91,14 @@ def cost_figures(
     wanted: Sequence[float] = (0.2, 0.1, 0.05, 0.02),
     steps: Sequence[int] = (8, 10, 12, 14, 16, 20, 26, 32),
     seeds: int = 4,
-    rtol: float = 1e-3,
 ) -> Figures:
     """The run with the fewest evaluations that has each error, at the pipeline's own guidance, in medians over samples.
 
     Where none has it, it is left out.
     """
-    target = pipeline_target(pipe, inputs, seeds=seeds, rtol=rtol)
+    target = pipeline_target(pipe, inputs, seeds=seeds)
     solvers = ("unipc", "dpm++2m", "deis")
     front = pareto_front([measure(target, name, n, repeats=1) for name in solvers for n in steps], "evaluations")
     found = {f"{error:g}": [row for row in front if row["error"] <= error] for error in wanted}
     costs = {error: {key: rows[0][key] for key in OF_ROWS} for error, rows in found.items() if rows}
-    return {"guidance_scale": target.guidance.scale, "conditions": len(target.noise), "cost_at_error": costs}
+    return {"guidance_scale": target.guidance_scale, "conditions": len(target.truth), "cost_at_error": costs}

@@ -12,8 +12,7 @@ import torch
 
 from tests.helpers.calls import seeded
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
-from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
-from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION, relative_rms
 from unitouch_gen.sampling import DIVERGED_RMS, SOLVERS, ReturnCode, RunReport, prepare_steps, sample
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED

@@ -9,8 +9,7 @@ import torch
 from scipy.integrate import quad
 
 from unitouch_gen.errors import NotConvergedError
-from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
-from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION, relative_rms
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedule import NoiseSchedule, alpha
 from unitouch_gen.solvers import SOLVERS, denoised_at_zero, exponential_integral, sample_ddim

@@ -1,6 +1,5 @@
 """`unitouch-gen work-precision` and `stability`: error, run time and extreme cases of solvers on any checkpoint."""
 
-import copy
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +10,7 @@ from typer import Exit, Option, echo
 from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, did_you_mean
-from unitouch_gen.files import read_settings, reading
+from unitouch_gen.files import reading
 from unitouch_gen.weights import FAMILY
 
 
@@ -37,6 +36,7 @@ def work_precision(
 
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
+    from unitouch_gen.pipelines.tiny import distilled
 
     if (problem is None) == (pipeline is None):
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
@@ -62,24 +62,17 @@ def work_precision(
     else:
         name = check_choice("--pipeline", pipeline, DRAWING)
         pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
-        student, settings = None, dict[str, Any]()
+        turbo = None
         if lora is not None and "turbo" in names:
-            from unitouch_gen.pipelines.tiny import with_lora
-
             with reading("--lora", lora):
-                student = with_lora(copy.deepcopy(pipe.unet), lora)
-                if (lora / "defaults.json").is_file():
-                    settings = read_settings("--lora", lora / "defaults.json")
-        target = wp.pipeline_target(
-            pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, student=student,
-            timesteps=settings.get("default_timesteps"),
-        )  # fmt: skip
+                turbo = distilled(pipe, lora)
+        target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, turbo=turbo)
         if "default" in names:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up
     rows = [wp.measure(target, **point) for point in tqdm(points, disable=None)]
     wp.save(output, target, rows)
-    echo(f"{target.name}, guidance {target.guidance.scale:g}; the reference's own error is {target.own_error:.1e}")
+    echo(f"{target.name}, guidance {target.guidance_scale:g}; the reference's own error is {target.own_error:.1e}")
     best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
             for row in wp.pareto_front(rows, "evaluations")]  # fmt: skip
     print_table(["cheapest", "solver", "error", "evaluations", "seconds per sample"], best)

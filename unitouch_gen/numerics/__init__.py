@@ -1,1 +1,1 @@
-"""How good an answer is for the time it takes: exact problems, references, work-precision, stability."""
+"""How good an answer is for the time it takes: exact problems, work-precision, stability."""

@@ -1,4 +1,4 @@
-"""Problems whose flow is known: Gaussian mixtures with their best denoisers, and a set of them by name.
+"""Problems whose flow is known: Gaussian mixtures with their best denoisers, their flows, and a set of them by name.
 
 Given x = x_0 + sigma n, the best prediction of data x_0 ~ sum_k N(m_k, diag v_k) / K is a mean of linear ones, each
 weighted by how probable its component is. All of it is computed in float64. Latents have four channels, as those of
@@ -7,18 +7,21 @@ alike, so that Gaussians along the pixels stand for those along any.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from diffusers import DDIMScheduler
+from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from unitouch_gen.numerics.reference import solve_flow, solve_reference
+from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.sampling import Guidance, Network, RunReport, prepare_steps, sample
 from unitouch_gen.schedule import NoiseSchedule, alpha
+from unitouch_gen.solvers import MIN_LEVEL_RATIO, Denoise, denoised_at_zero
 
 STABLE_DIFFUSION: dict[str, Any] = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
@@ -111,12 +114,14 @@ class Problem:
         return predict
 
     def run(
-        self, noise: Tensor, solver: str | None = None, network: Network | None = None, throw: bool = True, **steps: Any
-    ) -> tuple[Tensor, RunReport]:
+        self, noise: Tensor, solver: str | None = None, network: Network | None = None, scheduler: Any = None,
+        throw: bool = True, **steps: Any,
+    ) -> tuple[Tensor, RunReport]:  # fmt: skip
         """Latents and report of one run from unit-variance noise; `steps` are arguments of `prepare_steps`."""
         report, network = RunReport(), network or self.network(len(noise))
-        made = prepare_steps(self.scheduler(), solver=solver, **steps)
-        return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
+        made = prepare_steps(scheduler or self.scheduler(), solver=solver, **steps)
+        with report.stage("denoising"):
+            return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
 
     def path(self, noise: Tensor, sigmas: list[float]) -> list[Tensor]:
         """Where the exact flow is at falling noise levels, (B, 4, h, h) float64 each.
@@ -127,16 +132,57 @@ class Problem:
         start = noise.double() * math.hypot(1.0, first)
         if not self.is_gaussian or self.guidance.active:
             lower = [sigma for sigma in sigmas if sigma < 0.999999 * first]
-            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-9)[-len(sigmas) :]
+            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-10)[-len(sigmas) :]
         mean, variance = (values[0].view(self.shape) for values in (self.data.means, self.data.variances))
         return [mean + ((variance + sigma**2) / (variance + first**2)).sqrt() * (start - mean) for sigma in sigmas]
 
     def solution(self, noise: Tensor) -> Tensor:
-        """Where the exact flow ends."""
+        """Where the exact flow ends; D is continued from its last levels to sigma = 0 as solvers do it."""
         if self.is_gaussian and not self.guidance.active:
             return self.path(noise, [0.0])[0]
         last = min(1e-4 * self.smallest_deviation, self.schedule.sigma_min)
-        return solve_reference(self.denoise, noise, self.schedule, rtol=1e-9, last=last)[0]
+        ends = [MIN_LEVEL_RATIO * last, last]
+        states = zip(ends, self.path(noise, ends), strict=True)
+        return denoised_at_zero([(sigma, self.denoise(x, sigma)) for sigma, x in states])
+
+
+def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
+    """Root-mean-square distance of each sample (B, ...) to the truth, over the truth's own size, float64 (B,)."""
+    truth = truth.double().flatten(1)
+    return (value.double().flatten(1) - truth).norm(dim=1) / truth.norm(dim=1)
+
+
+def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float) -> list[Tensor]:
+    """x at each of falling noise levels, (B, C, h, w) float64, from x at the first of them.
+
+    By scipy's DOP853, an explicit Runge-Kutta method of order 8, in u = log sigma, where the linear part of the flow
+    has rates between 0 and 1 however ill-conditioned the data is. The state is z = alpha x, whose root mean square
+    stays near 1 along the path,
+
+        dz/du = alpha^2 z - alpha D(z / alpha, sigma),
+
+    so one tolerance serves as the relative and the absolute one.
+
+    Args:
+        denoise: D(x, sigma) of float64 states.
+        rtol: Tolerance of a step, relative to the RMS of each sample, from 1e-12.
+
+    Raises:
+        NotConvergedError: If no step is small enough.
+    """
+
+    def slope(u: float, z: np.ndarray) -> np.ndarray:
+        sigma = math.exp(u)
+        denoised = denoise(torch.from_numpy(z.reshape(x.shape)) / alpha(sigma), sigma)
+        return alpha(sigma) ** 2 * z - alpha(sigma) * denoised.numpy().reshape(-1)
+
+    levels, start = [math.log(sigma) for sigma in sigmas], (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
+    # Its norm is over the whole batch: divided by sqrt(B), no sample errs by more, even if all of the error is its own.
+    tolerance = max(rtol / math.sqrt(len(x)), 1e-13)
+    found = solve_ivp(slope, (levels[0], levels[-1]), start, "DOP853", levels, rtol=tolerance, atol=tolerance)
+    if not found.success:
+        raise NotConvergedError(f"The reference stopped after {found.nfev} evaluations: {found.message}")
+    return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(found.y.T, sigmas, strict=True)]
 
 
 # The problems by name -------------------------------------------------------------------------------------------------

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.examples import example
-from unitouch_gen.numerics.problems import PROBLEMS, Problem
-from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.problems import PROBLEMS, Problem, relative_rms
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.solvers import denoised_at_zero
 

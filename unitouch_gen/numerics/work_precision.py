@@ -1,22 +1,21 @@
-"""Error against run time of solvers, on a problem or on a pipeline's network, in the manner of SciML's work-precision
+"""Error against run time of solvers, on a problem or in calls of a pipeline, in the manner of SciML's work-precision
 sets: all start from the same noise, errors are of the latents against one reference, and failures are results too.
 """
 
+import copy
 import io
 import json
 import math
 import platform
-import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, LCMScheduler
+from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
@@ -24,10 +23,9 @@ from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning, first_line
 from unitouch_gen.files import write_file
-from unitouch_gen.numerics.problems import Problem
-from unitouch_gen.numerics.reference import relative_rms, solve_reference
-from unitouch_gen.sampling import SOLVERS, Guidance, Network, RunReport, prepare_steps, sample
-from unitouch_gen.schedule import TRAINED, NoiseSchedule, alpha, to_denoised
+from unitouch_gen.numerics.problems import Problem, relative_rms
+from unitouch_gen.sampling import SOLVERS, RunReport
+from unitouch_gen.schedule import TRAINED
 
 Row = dict[str, Any]
 """A result: solver, steps or tolerance, quartiles of the error, evaluations, seconds per sample, failures and why."""
@@ -48,75 +46,79 @@ NAMES = (*SOLVERS, "adaptive", "default", "turbo", *BASELINES)
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A network with its conditions bound, N noises to start from, and where the exact flow ends from them."""
+    """What is run from N noises, and where the exact flow ends from them."""
 
     name: str
-    network: Network
-    scheduler: Any  # the pipeline's own
-    guidance: Guidance
-    noise: Tensor  # (N, C, h, w)
+    run: Callable[[str, int | None, float | None], tuple[Tensor, RunReport]]
+    """(one of `NAMES`, steps, tolerance) -> latents of the finite samples, report."""
+    guidance_scale: float
     truth: Tensor  # (N, C, h, w) float64
     own_error: float = 0.0  # of the truth, median; 0 for a closed form
     default_steps: int | None = None  # of a pipeline
-    turbo: Network | None = None  # which needs no guidance
-    turbo_timesteps: Sequence[int] | None = None  # that it was distilled for, if not those of `LCMScheduler`
+
+
+def scheduler_of(solver: str, own: Any) -> Any:
+    """The scheduler of a baseline, for a network that was trained with another one; of other solvers that one."""
+    if solver not in BASELINES:
+        return own
+    kind, settings = BASELINES[solver]
+    return kind(**{name: own.config[name] for name in TRAINED}, **settings)
 
 
 def problem_target(problem: Problem, seeds: int = 8) -> Target:
     """A problem from some noises."""
     noise = problem.noise(seeds)
-    network, truth = problem.network(seeds), problem.solution(noise)
-    return Target(problem.name, network, problem.scheduler(), problem.guidance, noise, truth)
+
+    def run(solver: str, steps: int | None, tolerance: float | None) -> tuple[Tensor, RunReport]:
+        latents, report = problem.run(
+            noise, solver if solver in SOLVERS else None, scheduler=scheduler_of(solver, problem.scheduler()),
+            num_inference_steps=steps, tolerance=tolerance, throw=False,
+        )  # fmt: skip
+        return latents[[code.finite for code in report.codes]], report
+
+    return Target(problem.name, run, problem.guidance_scale, problem.solution(noise))
 
 
-@torch.no_grad()
 def pipeline_target(
     pipe: Any, inputs: Mapping[str, Tensor], *, name: str = "", seeds: int = 2, guidance_scale: float | None = None,
-    rtol: float = 1e-4, student: Any = None, timesteps: Sequence[int] | None = None, **options: Any,
+    turbo: Any = None,
 ) -> Target:  # fmt: skip
-    """The network of a pipeline under conditions, from some noises each.
+    """Calls of a pipeline under conditions, from some noises each.
+
+    The reference is 400 steps of UniPC, its own error the distance of 200 steps to it. A trained network ripples with
+    the waves of the timestep's embedding, by about one percent over some ten levels, and tolerances far below that
+    follow every ripple.
 
     Args:
-        inputs: Arguments of the pipeline's call that hold a row for each condition; `options` are more of them.
+        inputs: Arguments of the pipeline's call that hold a row for each condition.
         seeds: Noises for each condition.
-        rtol: Tolerance of the reference. A trained network ripples with the waves of the timestep's embedding, by about
-            one percent over some ten levels; far below this tolerance solvers follow every ripple.
-        student, timesteps: A UNet that was distilled from the pipeline's, for "turbo", and what it was distilled for.
+        turbo: The pipeline distilled, which needs no guidance, for "turbo".
+
+    Raises:
+        NonFiniteError: If the reference is not finite.
     """
-    guidance = Guidance(pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale)
-    seen: list[tuple[Tensor, dict[str, Any]]] = []
-    hook = pipe.unet.register_forward_pre_hook(lambda _, args, kwargs: seen.append((args[0], kwargs)), with_kwargs=True)
-    repeated = {key: value.repeat_interleave(seeds, dim=0) for key, value in inputs.items()}
-    call = {"solver": "ddim", "num_inference_steps": 1, "guidance_scale": guidance.scale, "output_type": "latent"}
-    try:
+    scale = pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale
+
+    def run(
+        solver: str, steps: int | None, tolerance: float | None = None, throw: bool = False
+    ) -> tuple[Tensor, RunReport]:
+        called = copy.copy(turbo if solver == "turbo" else pipe)
+        called.scheduler = scheduler_of(solver, called.scheduler)
+        if solver in ("default", "turbo") and steps == called.config["default_num_inference_steps"]:
+            steps = None  # or timesteps that it was distilled for would not be taken
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnfamiliarInputWarning)
-            pipe(**repeated, **call, generator=torch.Generator().manual_seed(0), throw=False, **options)
-    finally:
-        hook.remove()
-    (states, conditions), unet, scheduler = seen[0], pipe.unet, pipe.scheduler
-    channels, schedule = unet.config.out_channels, NoiseSchedule.of(scheduler)
+            output = called(
+                **inputs, num_images_per_prompt=seeds, solver=solver if solver in SOLVERS else None,
+                num_inference_steps=steps, tolerance=tolerance, guidance_scale=1.0 if solver == "turbo" else scale,
+                generator=torch.Generator().manual_seed(0), output_type="latent", throw=throw,
+            )  # fmt: skip
+        return output.images.cpu(), output.report
 
-    def network(z: Tensor, timestep: Tensor, unet: Any = unet) -> Tensor:
-        """Of a batch without unconditional half, the conditions of the other one."""
-        of_rows = {key: value[-len(z) :] if isinstance(value, Tensor) else value for key, value in conditions.items()}
-        beside = states[-len(z) :, channels:]  # what the network is shown as further channels
-        return unet(torch.cat([z.to(states), beside], dim=1), timestep.to(states.device), **of_rows)[0]
-
-    @torch.no_grad()
-    def denoise(x: Tensor, sigma: float) -> Tensor:
-        z, timestep = x * alpha(sigma), schedule.timestep(sigma).float()
-        prediction = network(torch.cat([z] * 2) if guidance.active else z, timestep).cpu().double()
-        prediction = guidance.combine(prediction) if guidance.active else prediction
-        return to_denoised(prediction, z, sigma, scheduler.config.prediction_type)
-
-    samples = len(states) // (2 if guidance.active else 1)
-    noise = torch.randn(samples, channels, *states.shape[2:], generator=torch.Generator().manual_seed(0))
-    truth, disagreement = solve_reference(denoise, noise, schedule, rtol)
-    own_error, steps = disagreement.median().item(), pipe.config["default_num_inference_steps"]
-    turbo = None if student is None else partial(network, unet=student)
-    noise = noise.to(states.device)
-    return Target(name, network, scheduler, guidance, noise, truth, own_error, steps, turbo, timesteps)
+    most = min(400, pipe.scheduler.config.num_train_timesteps)
+    coarse, truth = (run("unipc", steps, throw=True)[0].double() for steps in (most // 2, most))
+    own_error = relative_rms(coarse, truth).median().item()
+    return Target(name, run, scale, truth, own_error, pipe.config["default_num_inference_steps"])
 
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor]:
@@ -134,35 +136,20 @@ def measure(
     target: Target, solver: str, steps: int | None = None, tolerance: float | None = None, repeats: int = 3
 ) -> Row:
     """One result; what the run raises is its reason."""
-    row: Row = {"solver": solver, "steps": steps, "tolerance": tolerance, "samples": len(target.noise), "reason": ""}
+    samples = len(target.truth)
+    row: Row = {"solver": solver, "steps": steps, "tolerance": tolerance, "samples": samples, "reason": ""}
     row["default"] = solver == "default" and steps == target.default_steps
-    scheduler: Any = target.scheduler
-    network: Any = target.network
-    guidance = target.guidance
-    if solver == "turbo":
-        scheduler, guidance = LCMScheduler.from_config(scheduler.config), Guidance(1.0)
-        network = target.turbo
-    elif solver in BASELINES:
-        kind, settings = BASELINES[solver]
-        scheduler = kind(**{name: scheduler.config[name] for name in TRAINED}, **settings)
-    named, seconds, report = solver if solver in SOLVERS else None, [], RunReport()
-    given: dict[str, Any] = {"num_inference_steps": steps}
-    if solver == "turbo" and target.turbo_timesteps and len(target.turbo_timesteps) == steps:
-        given = {"timesteps": target.turbo_timesteps}
     try:
-        prepared = prepare_steps(scheduler, solver=named, tolerance=tolerance, **given)
-        for _ in range(repeats):
-            report, started = RunReport(), time.perf_counter()
-            added = torch.Generator().manual_seed(1)  # noise of some schedulers, other than what they start from
-            latents = sample(network, target.noise, prepared, report, guidance=guidance, generator=added, throw=False)
-            seconds.append((time.perf_counter() - started) / len(latents))
+        runs = [target.run(solver, steps, tolerance) for _ in range(repeats)]
     except Exception as error:  # the other points are worth having, and this one says what it was
-        return {**row, "failures": len(target.noise), "reason": f"{type(error).__name__}: {first_line(error)}"}
+        return {**row, "failures": samples, "reason": f"{type(error).__name__}: {first_line(error)}"}
+    latents, report = runs[-1]
     finite, failed = ([code.finite for code in report.codes], [code for code in report.codes if code != "success"])
-    errors = relative_rms(latents.cpu(), target.truth)[finite].numpy()
+    errors = relative_rms(latents, target.truth[finite]).numpy()
     if len(errors):
         row |= zip(("error_low", "error", "error_high"), np.quantile(errors, (0.25, 0.5, 0.75)).tolist(), strict=True)
-    row |= {"evaluations": report.evaluations, "seconds": min(seconds), "failures": len(failed)}
+    seconds = min(report.seconds["denoising"] for _, report in runs) / samples
+    row |= {"evaluations": report.evaluations, "seconds": seconds, "failures": len(failed)}
     return {**row, "reason": ", ".join(sorted({code.value for code in failed}))}
 
 
@@ -189,7 +176,7 @@ def draw_chart(target: Target, rows: Sequence[Row]) -> Figure:
     """Error against seconds and evaluations. Bars are quartiles, the wide band is the Pareto front with its steps or
     tolerances, a star what a call without options runs."""
     figure = Figure(figsize=(12.6, 5.4), layout="constrained")
-    figure.suptitle(f"{target.name}, guidance {target.guidance.scale:g}: error against run time")
+    figure.suptitle(f"{target.name}, guidance {target.guidance_scale:g}: error against run time")
     left, right = figure.subplots(1, 2, sharey=True)
     _draw_panel(left, target, rows, "seconds", "seconds for one sample")
     _draw_panel(right, target, rows, "evaluations", "evaluations of the network")
@@ -227,7 +214,7 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
 
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
     """Writes `results.json` and `chart.png`."""
-    values = {"target": target.name, "guidance_scale": target.guidance.scale, "own_error": target.own_error,
+    values = {"target": target.name, "guidance_scale": target.guidance_scale, "own_error": target.own_error,
               "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "rows": list(rows)}  # fmt: skip
     picture = io.BytesIO()
     draw_chart(target, rows).savefig(picture, format="png", dpi=160, facecolor="white")
