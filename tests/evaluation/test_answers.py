@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers.components import make_language_parts
-from unitouch_gen.evaluation.answers import attributes_of, caption_table, measured, rated
+from unitouch_gen.evaluation.answers import attributes_of, caption_table, measured
 from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.attributes import ATTRIBUTES
@@ -81,11 +80,3 @@ def test_attributes_are_whole_words():
     known = {"slightly rough", "irregular", "brick", "a rod"}
     assert attributes_of("slightly rough red irregular brick, a rod") == known
     assert attributes_of("a coarseness of bricks") == set()
-
-
-def test_a_language_model_rates_from_1_to_5(tmp_path):
-    parts = make_language_parts()
-    for name in ("language_model", "tokenizer"):
-        parts[name].save_pretrained(tmp_path)
-    ratings = rated(tmp_path, ["rough brick."] * 2, ["rough brick.", "a wet leaf."])
-    assert len(ratings) == 2 and all(1.0 < rating < 5.0 for rating in ratings)

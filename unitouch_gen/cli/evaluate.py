@@ -47,7 +47,6 @@ def evaluate(
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
-    judge: Annotated[Path | None, Option(help="Folder of a language model that rates captions from 1 to 5.")] = None,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False,
 ) -> None:  # fmt: skip
@@ -75,7 +74,7 @@ def evaluate(
         else:
             known = [name for name in NAMED if name in joint.config.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps=table == "grasp")
-        rows = figures_of(table, sets, joint, processor, pipe, each, judge)
+        rows = figures_of(table, sets, joint, processor, pipe, each)
     show(table, rows)
     if output is not None:
         facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
@@ -117,7 +116,7 @@ def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: 
             raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
 
 
-def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, each: int, judge: Path | None) -> Rows:
+def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, each: int) -> Rows:
     """Figures of a table by row and column, one for each world."""
     import torch
 
@@ -143,7 +142,7 @@ def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, eac
         elif table == "retrieval":
             found = tables.retrieval_table(splits)
         elif table == "caption":
-            found = caption_table(pipe, splits, embed, each, judge)
+            found = caption_table(pipe, splits, embed, each)
         else:
             felt = {*splits["test"].sensors}
             if (domain, seed) in drawn or (table == "x-to-touch" and not felt <= {*pipe.config.sensors}):
