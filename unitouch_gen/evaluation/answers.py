@@ -14,27 +14,18 @@ from unitouch_gen.evaluation.controls import Figures, others
 from unitouch_gen.evaluation.generated import some
 from unitouch_gen.evaluation.metrics import cosines
 from unitouch_gen.evaluation.zero_shot import PROMPTS
-from unitouch_gen.world import MATERIALS
-from unitouch_gen.world.captions import DIRECTION_WORDS, HARDNESS_WORDS, ROUGHNESS_WORDS, SHAPE_WORDS
 from unitouch_gen.world.questions import TOPICS
 
 Asked = Mapping[str, tuple[str, Sequence[str]]]
 """By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
-
-FELT = (
-    *ROUGHNESS_WORDS, *HARDNESS_WORDS, *DIRECTION_WORDS, "regular", "irregular", "fine", "coarse",
-    *(word for words in SHAPE_WORDS.values() for word in words),
-    *(word for material in MATERIALS for word in (material.name, *material.feel)),
-)  # fmt: skip
-"""What captions say that can be felt: all but colours."""
 
 
 def caption_table(pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Tensor], each: int) -> dict[str, Figures]:
     """Shares of answers that are right, of `each` contacts of every material of the split "test", by row.
 
     Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of hardness and
-    grasps accuracy is balanced over what is true; of grains it is of such as there are. Attributes of captions are
-    right if any true caption has them; ROUGE-L is that to the nearest of these.
+    grasps accuracy is balanced over what is true; of grains it is of such as there are. ROUGE-L of captions is that to
+    the nearest true one.
 
     Args:
         pipe: A `TouchToTextPipeline`.
@@ -85,11 +76,6 @@ def measured(asked: Sequence[Asked], answers: Mapping[str, Sequence[str]], mater
         figures[topic.figure] = sum(sum(found) / len(found) for found in groups) / len(groups)
     if "caption" in answers:
         true = [list(one["caption"][1]) for one in asked]
-        shares = []
-        for references, text in zip(true, answers["caption"], strict=True):
-            said = attributes_of(text)
-            shares.append(len(said & attributes_of(" ".join(references))) / max(1, len(said)))
-        figures["caption's attributes"] = sum(shares) / len(shares)
         scores = rouge_score(list(answers["caption"]), true, accumulate="best", rouge_keys="rougeL")
         figures["ROUGE-L"] = float(scores["rougeL_fmeasure"])
     return figures
@@ -99,9 +85,3 @@ def class_of(text: str, words: Mapping[str, str]) -> str | None:
     """The class that the first of some words in a text stands for; `None` if the text has none of them."""
     found = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
     return words[found[0]] if found else None
-
-
-def attributes_of(text: str) -> set[str]:
-    """The words of `FELT` in a text, the longest where one holds another."""
-    longest = "|".join(sorted(map(re.escape, FELT), key=len, reverse=True))
-    return set(re.findall(rf"\b(?:{longest})\b", text))
