@@ -108,7 +108,7 @@ def inputs(
     embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
 
     def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
-        return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
+        return cached_latents(stage, vae, f"{name}{size}", splits, images)
 
     latents = latents_of("touch", [split.touch for split in splits])
     sensor = torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors)))
