@@ -1,4 +1,4 @@
-"""What stages are trained on: data sets in their published layouts, the built-in world, and mixtures of them."""
+"""What stages are trained on: data sets in their published layouts, or the built-in world."""
 
 from unitouch_gen.training.data.cache import computed_once
 from unitouch_gen.training.data.columns import DataConfig, Rendered, Source, columns_of, material_names, sensor_numbers

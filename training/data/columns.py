@@ -40,7 +40,7 @@ class SetConfig(Settings):
 
 
 class DataConfig(Settings):
-    """What a stage is trained on: data sets, the built-in world, or both."""
+    """What a stage is trained on: data sets or the built-in world."""
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None  # contacts of the world
@@ -49,9 +49,9 @@ class DataConfig(Settings):
     audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
     def sources(self) -> list[Source]:
-        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
-        if self.drawn is None and not self.sets:
-            raise InvalidInputError("`data` names nothing to learn; give it `sets`, as [{path: FOLDER}], or `drawn`.")
+        """All there is to train on, yet to be rendered or decoded: contacts or data sets of one sensor each."""
+        if (self.drawn is None) == (not self.sets):
+            raise InvalidInputError("`data` takes one of the two: `sets`, as [{path: FOLDER}], or `drawn`.")
         sources: list[Source] = [*self.drawn.sources()] if self.drawn else []
         for one in self.sets:
             data = open_dataset(one.path, **one.model_dump(exclude={"path", "split"}))
@@ -100,7 +100,7 @@ def columns_of(
         if lacking or len(data) < 2:
             wrong = f"no {few(lacking)}" if lacking else "a single record, where two are the least"
             raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
-    if config.touch_size not in (None, processor.image_size) and not all(isinstance(one, RecordSet) for one in sources):
+    if config.touch_size not in (None, processor.image_size) and config.drawn is not None:
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
     names = material_names(sources) if "material" in needs else ()
     return [

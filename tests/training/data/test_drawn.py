@@ -96,5 +96,7 @@ def test_other_sizes_and_sounds_are_rendered_anew(splits, place: Path, processor
     [heard] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     np.testing.assert_allclose(heard.audio, splits[0].audio - 1.0 / before.std, atol=1e-2)
     assert len({small.fingerprint, heard.fingerprint, splits[0].fingerprint}) == 3
+    with pytest.raises(InvalidInputError, match="takes one of the two"):
+        DataConfig(drawn=CONFIG.drawn, sets=[{"path": str(place)}]).sources()
     with pytest.raises(InvalidInputError, match="`touch_size` is 64; with drawn sensors"):
         columns_of(SOURCES[:1], place, CONFIG.model_copy(update={"touch_size": 64}), processor, ())
