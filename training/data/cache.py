@@ -11,27 +11,21 @@ from torch import Tensor
 from tqdm.contrib.concurrent import thread_map
 
 from unitouch_gen.errors import first_line
-from unitouch_gen.files import natural, replacing, writing_folder
+from unitouch_gen.files import replacing, writing_folder
 from unitouch_gen.training.data.sets import RecordSet
 
 
 def for_each(call: Callable[[int], object], data: RecordSet, quiet: bool = False) -> dict[int, str]:
-    """Calls with the number of each record, in threads, and returns why some cannot be read.
-
-    They go in the order of their files, and neighbours to one thread, as a video is read forwards.
-    """
-    order = sorted(range(len(data)), key=lambda row: natural(str(data.records[row].touch)))
+    """Calls with the number of each record, in threads, and returns why some cannot be read."""
     broken: dict[int, str] = {}
 
-    def call_some(rows: list[int]) -> None:
-        for row in rows:
-            try:
-                call(row)
-            except (OSError, ValueError) as error:
-                broken[row] = first_line(error)
+    def call_one(row: int) -> None:
+        try:
+            call(row)
+        except (OSError, ValueError) as error:
+            broken[row] = first_line(error)
 
-    blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
-    thread_map(call_some, blocks, desc=str(data), unit="64 records", disable=quiet)
+    thread_map(call_one, range(len(data)), desc=str(data), unit="records", disable=quiet)
     return dict(sorted(broken.items()))
 
 
