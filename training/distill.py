@@ -29,7 +29,6 @@ from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.losses import denoising_loss, predict
 from unitouch_gen.training.recipe import Arguments, Settings, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage
@@ -169,9 +168,9 @@ def conditioned_touches(
 ) -> tuple[Conditioned, ArrayDataset]:
     """The objective that trains a network of touches, and its data."""
     sensors, with_gels = settings["sensors"], unet.config.in_channels != unet.config.out_channels
+    if with_gels and stage.data.drawn is None:
+        raise InvalidInputError("`data.sets` have no untouched gels, which `model` learns from; leave them out.")
     for source in stage.sources:
-        if with_gels and not isinstance(source, DrawnContacts):
-            raise InvalidInputError("`data.sets` have no untouched gels, which `model` learns from; leave them out.")
         if sensors and (source.sensor is not None or not with_gels):
             check_choice("data: sensor", source.sensor, sensors)
     with reading("model", stage.folders["model"]):

@@ -8,7 +8,7 @@ Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers'
 
 import json
 from collections.abc import Iterable
-from pathlib import Path
+from typing import Any
 
 import diffusers
 import numpy as np
@@ -19,9 +19,10 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.evaluation.contacts import in_batches
 from unitouch_gen.models.autoencoders import CLASSES, Autoencoder, encode, encode_raw, read_autoencoder, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import computed_once, weights_hash
+from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage
 
@@ -87,12 +88,17 @@ def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
 
 
 @torch.no_grad()
+def latents_of(vae: Autoencoder, images: Any) -> Tensor:
+    """Scaled latents (N, C, h, w) of uint8 pixels (N, 3, H, W)."""
+    return in_batches(len(images), lambda rows: encode(vae, to_signed(torch.from_numpy(np.array(images[rows])))))
+
+
 def cached_latents(
-    vae: Autoencoder, images: Iterable[np.ndarray], key: str, cache: Path, batch_size: int = 128
+    stage: Stage, vae: Autoencoder, name: str, splits: list[Rendered], images: Iterable[np.ndarray]
 ) -> Tensor:
-    """Scaled latents (N, C, h, w) of uint8 pixels (n, 3, H, W), named by `key`, once for each state of the weights."""
-    file = Path(cache) / f"{key}-scale{vae.config.scaling_factor:.6g}-{weights_hash(vae)}.safetensors"
-    return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
+    """Latents of all arrays of images, which are columns of the splits, by the autoencoder to build on."""
+    file = f"{name}-latents-scale{vae.config.scaling_factor:.6g}"
+    return stage.computed_once(file, "vae", splits, lambda: torch.cat([latents_of(vae, part) for part in images]))
 
 
 def make_autoencoder(model: Arguments) -> Autoencoder:

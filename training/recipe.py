@@ -42,15 +42,13 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     `sets` are named, they stand in the place of the contacts that the base draws.
     """
     recipe = read_settings("recipe", _file_of("recipe", path), yaml.safe_load)
-    data, drawn_by_base = recipe.get("data"), False
+    data = recipe.get("data")
     if isinstance(data, dict) and "base" in data:
-        drawn_by_base = "drawn" not in data and not any(one.startswith("data.drawn") for one in overrides)
         base = read_settings("data.base", _file_of("data.base", data.pop("base")), yaml.safe_load)
+        if "sets" in data or any(one.startswith("data.sets") for one in overrides):
+            base.pop("drawn", None)
         recipe["data"] = base | data
-    recipe = overridden(recipe, overrides)
-    if drawn_by_base and recipe["data"].get("sets"):
-        recipe["data"].pop("drawn", None)
-    return recipe
+    return overridden(recipe, overrides)
 
 
 def _file_of(argument: str, path: str | Path) -> Path:

@@ -21,10 +21,11 @@ from typer import Option
 
 from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import image_embeddings
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
-from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
+from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, computed_once
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 
@@ -149,9 +150,20 @@ class Stage:
         names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
         return "-".join([*names, "train", shown])
 
+    def computed_once(self, name: str, option: str, splits: list[Rendered], compute: Callable[[], Tensor]) -> Tensor:
+        """What a model makes of `splits`: once for the weights that an option named, at each call if none did."""
+        weights = self.inputs.get("model", self.inputs.get(option))
+        if weights is None:
+            return compute()
+        return computed_once(self.cache / f"{name}-{self.key(splits)}-{weights[:16]}.safetensors", compute)
+
     def image_embeddings(self, model: UniTouchModel, splits: list[Rendered]) -> Tensor:
-        """Embeddings (N, D) of all pictures, un-normalised, computed once."""
-        return image_embeddings(model, [split.image for split in splits], self.key(splits), self.cache)
+        """Embeddings (N, D) of all pictures, un-normalised."""
+
+        def compute() -> Tensor:
+            return torch.cat([image_embeddings(model.eval(), "image", split.image) for split in splits])
+
+        return self.computed_once("image-embeddings", "joint", splits, compute)
 
     def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""

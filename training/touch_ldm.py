@@ -26,7 +26,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import DrawnContacts, Rendered, sensor_numbers
+from unitouch_gen.training.data import Rendered, sensor_numbers
 from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents
@@ -108,14 +108,13 @@ def inputs(
     embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
 
     def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
-        return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
+        return cached_latents(stage, vae, f"{name}{size}", splits, images)
 
     latents = latents_of("touch", [split.touch for split in splits])
     sensor = torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors)))
     if not with_gels:
         return ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor), None
-    drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
-    gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in drawn)  # (2 G, 3, S, S)
+    gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in stage.sources)  # type: ignore[union-attr]
     places = torch.from_numpy(np.concatenate(places_of(splits)))
     # Each contact is learnt by its second sensor as well, which has no name.
     seconds = latents_of("second", [split.second for split in splits if split.second is not None])
@@ -132,10 +131,7 @@ def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
-    drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
-    with_gels = len(drawn) == len(stage.sources)
-    if not with_gels and None in [source.sensor for source in drawn]:
-        raise InvalidInputError("`data.drawn.sensors` has a null, which `data.sets` do not go with; leave one out.")
+    with_gels = stage.data.drawn is not None
     classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
     unet = stage.unet(recipe.model, num_class_embeds=classes)
     wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}

@@ -30,7 +30,6 @@ from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
 from unitouch_gen.files import read_settings, write_file
-from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.recipe import Settings, Share
 
@@ -54,7 +53,6 @@ class TrainerConfig(Settings):
         Literal["no", "fp16", "bf16"],
         BeforeValidator(lambda value: "no" if value is False else value),  # as YAML 1.1 reads a bare no
     ] = "no"
-    gradient_checkpointing: bool = False  # compute what blocks made once more on the way back, in place of keeping it
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise
@@ -88,8 +86,6 @@ class Trainer:
         if config.batch_size % processes:
             raise InvalidInputError(f"`batch_size` is {config.batch_size}; take a multiple of {processes} processes.")
         self.trained: nn.Module = getattr(objective, "trained", objective)
-        if config.gradient_checkpointing:
-            checkpoint_gradients(self.trained)
         optimizer = _optimizer(self.trained, config)
         self.schedule = LambdaLR(optimizer, lambda step: rate_at(step, config, self.steps))
         self.objective, self.optimizer = self.accelerator.prepare(objective, optimizer)
@@ -206,18 +202,6 @@ def read_progress(output: Path) -> dict[str, Any]:
     if found := checkpoints_in(output):
         return read_settings("resume", found[-1] / "progress.json")
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
-
-
-def checkpoint_gradients(network: nn.Module) -> None:
-    """Makes the blocks of a network compute once more on the way back, in place of keeping what they made."""
-    module: Any
-    for module in network.modules():
-        if isinstance(module, UniTouchViT):
-            module.gradient_checkpointing = True
-        elif hasattr(module, "activation_checkpointing_enable"):  # transformers
-            module.activation_checkpointing_enable()
-        elif getattr(module, "_supports_gradient_checkpointing", False):  # diffusers
-            module.enable_gradient_checkpointing()
 
 
 def rate_at(step: int, config: TrainerConfig, steps: int) -> float:

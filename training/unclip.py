@@ -110,7 +110,7 @@ def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayD
     """Columns of pictures' latents, embeddings and numbers, and the caption of each picture."""
     splits = stage.splits("image", "text")
     embeds, captions = stage.image_embeddings(joint, splits), [caption for split in splits for caption in split.text]
-    latents = cached_latents(vae, [split.image for split in splits], f"image-latents-{stage.key(splits)}", stage.cache)
+    latents = cached_latents(stage, vae, "image", splits, [split.image for split in splits])
     return ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))), captions
 
 

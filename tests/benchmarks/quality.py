@@ -35,19 +35,14 @@ from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.answers import caption_table
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
-from unitouch_gen.evaluation.controls import (
-    class_means,
-    relief_statistics,
-    statistics,
-    untrained_like,
-    with_controls,
-)
+from unitouch_gen.evaluation.controls import class_means, statistics, untrained_like, with_controls
 from unitouch_gen.evaluation.generated import beside_class_means, generate, some
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
 from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
+from unitouch_gen.models.relief import relief
 from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
 from unitouch_gen.training.data.heldout import FIRST_SEED
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
@@ -247,7 +242,8 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     def embedded(pixels: np.ndarray) -> dict[str, np.ndarray]:
         found = {name: replace(joint, models={"touch": model}).features("touch", pixels).double().numpy()
                  for name, model in spaces.items()}  # fmt: skip
-        return found | {"statistics of the relief": relief_statistics(float_pixels(pixels))}
+        reliefs = relief(normalise_pixels(float_pixels(pixels))).movedim(1, -1).numpy()
+        return found | {"statistics of the relief": statistics([128.0 + 20.0 * one for one in reliefs])}
 
     clips = Clips.read(recordings / GELSIGHT)
     peaks, gels = (square_pixels(frames, size) for frames in (clips.peaks, clips.gels))

@@ -30,7 +30,7 @@ def percent(share: float) -> str:
 
 # Quality --------------------------------------------------------------------------------------------------------------
 
-ANSWERS = (*(topic.figure for topic in TOPICS.values() if topic.figure), "caption's attributes")
+ANSWERS = tuple(topic.figure for topic in TOPICS.values() if topic.figure)
 SHARES = ("material", "of the touch", "of the photo", "within 20", *ANSWERS)
 """Ends of the names of figures that are shares; others are correlations and distances."""
 

@@ -57,7 +57,7 @@ def test_questions_are_answered_about_every_touch(command, refused, here, capsys
     assert (code, err, len(answers)) == (0, "", 2)
     printed = command(*words)[1]
     assert "bright.png: " in printed and all(answer in printed for answer in answers)
-    assert answers[0] in command("ask", "in/bright.png", *words[2:], "--stream")[1]
+    assert command("ask", "in/bright.png", *words[2:])[1] == f"{answers[0]}\n"
     refused(command(*words[:2], " ", *words[3:]), "`question` is blank")
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import av
 import h5py
 import numpy as np
 from PIL import Image
@@ -22,19 +21,6 @@ def shade(number: int) -> Colour:
 def write_image(file: Path, colour: Colour, size: tuple[int, int] = (40, 32)) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size, colour).save(file)
-    return file
-
-
-def write_video(file: Path, colours: Sequence[Colour], rate: int = 30, group: int = 5) -> Path:
-    """H.264 with frames between key frames that refer to later ones, as cameras and editors write it."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"g": str(group), "bf": "2", "crf": "8"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for colour in colours:
-            pixels = np.broadcast_to(np.array(colour, np.uint8), (48, 64, 3)).copy()
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-        container.mux(stream.encode())
     return file
 
 

@@ -11,7 +11,6 @@ from tests.helpers.recordings import FIRMEST
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.videos import firmest, read_video
-from unitouch_gen.training.data.records import Frame
 
 
 def place_of_firmest(images: list[np.ndarray]) -> int:
@@ -47,7 +46,7 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     ],
 )  # fmt: skip
 def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
-    """In the reader of data sets, too; and its name is no address."""
+    """And its name is no address."""
     pytest.importorskip("av")
     file = recordings.write(tmp_path / "10:30 [a].mp4", list(recordings.frames()))
     stored = list(read_video("touch", file))
@@ -56,13 +55,11 @@ def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
     file.write_bytes(content[:at] + a + b + bytes(4) + c + d + content[at + 20 :])
     for one, other in zip(read_video("touch", file), stored, strict=True):
         np.testing.assert_array_equal(one, turned(other))
-    np.testing.assert_array_equal(Frame(str(file), index=9).read().permute(1, 2, 0), turned(stored[9]))
 
 
 def test_pixels_of_a_video_are_made_square(tmp_path):
     file = recordings.write(tmp_path / "wide.mkv", list(recordings.frames()), pixel_aspect=2)
     assert next(read_video("touch", file)).shape == (48, 128, 3)
-    assert Frame(str(file), index=0).read().shape == (3, 48, 128)
 
 
 def test_what_holds_no_contact_is_refused():

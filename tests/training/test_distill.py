@@ -195,7 +195,7 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
     quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "gels")
     for file in ("mine/touch/0.png", "mine/picture/0.png", "mine/touch/1.png", "mine/picture/1.png"):
         write_image(tmp_path / file, (200, 100, len(file)))
-    mine = f"{{path: {tmp_path / 'mine'}, sensor: digit}}"
+    mine = json.dumps({"path": str(tmp_path / "mine"), "sensor": "digit"}, separators=(",", ":"))
     make_pipelines()["touch-to-image"].save_pretrained(tmp_path / "teacher")
     other = shutil.copytree(tmp_path / "teacher", tmp_path / "other")
     (other / "model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
@@ -209,9 +209,9 @@ def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line
         ("teacher", "--set lora.target_modules=[to_p]", "`lora` does not fit the network"),
         ("teacher", "--set lora.rank=3", "In `lora`, `rank` is unknown"),
         ("teacher", "--set objective.timesteps=[9,99]", "`objective.timesteps` is [9, 99]: "),
-        ("gels", f"--set data.sets=[{mine}]", "`data.sets` have no untouched gels"),
+        ("gels", f"--set data.drawn=null --set data.sets=[{mine}]", "`data.sets` have no untouched gels"),
     ):
-        given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split(maxsplit=1))
+        given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split())
         with pytest.raises(SystemExit, match="2"):
             run(given)
         (line,) = capsys.readouterr().err.strip().splitlines()[-1:]

@@ -148,20 +148,13 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
     assert loss == pytest.approx((error + 1.25 * distance).item(), rel=1e-4)
 
 
-def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of_the_weights(tmp_path: Path) -> None:
+def test_latents_are_scaled_to_unit_variance() -> None:
     vae, pixels = autoencoder(scaling_factor=0.5), torch.from_numpy(PICTURES)
     with torch.no_grad():
         raw = vae.encode(to_signed(pixels)).latents
     scale = image_vae.latent_scale(vae, ArrayDataset(pixels=PICTURES))
     assert (raw * scale).std().item() == pytest.approx(1.0, abs=1e-3)
-    latents = image_vae.cached_latents(vae, [PICTURES[:4], PICTURES[4:]], "k", tmp_path, batch_size=3)
-    torch.testing.assert_close(latents, 0.5 * raw)
-    assert torch.equal(image_vae.cached_latents(vae, [], "k", tmp_path), latents)  # no picture is looked at
-    vae.register_to_config(scaling_factor=0.25)
-    torch.testing.assert_close(image_vae.cached_latents(vae, [PICTURES], "k", tmp_path), latents / 2)
-    with torch.no_grad():
-        next(vae.encoder.parameters()).mul_(1.5)
-    assert not torch.allclose(image_vae.cached_latents(vae, [PICTURES], "k", tmp_path), latents / 2)
+    torch.testing.assert_close(image_vae.latents_of(vae, PICTURES), 0.5 * raw)
 
 
 class Shown(nn.Module):

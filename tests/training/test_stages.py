@@ -185,7 +185,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
     monkeypatch.chdir(tmp_path / "here")
     for name, words, message in (
         ("image_text", "--set model.audio_config.size=3", "In `model`, `size` is unknown"),
-        ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
+        ("touch_vae", "--recipe touch_vae_paper", "`data` takes one of the two"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
         ("touch", "", "touch needs folders of models: python -m unitouch_gen.training touch --joint"),

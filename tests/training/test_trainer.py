@@ -1,6 +1,5 @@
 """The trainer on a linear regression, whose solution, averages and rates are known."""
 
-import copy
 import json
 import math
 from functools import partial
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoint_gradients, checkpoints_in, rate_at
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
@@ -170,17 +169,3 @@ def test_a_loss_that_is_not_finite_stops_the_run_at_its_last_checkpoint(tmp_path
     with pytest.raises(NonFiniteError, match=r"loss at step 7 is nan; its samples are \[7\]"):
         trainer.fit()
     assert [folder.name for folder in checkpoints_in(tmp_path)] == ["step-00000005"]
-
-
-@pytest.mark.parametrize("module", ["touch_model", "text_model"])
-def test_gradients_are_the_same_where_blocks_compute_once_more(model: UniTouchModel, module: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    images, ids = torch.randn(2, 3, 32, 32, generator=generator), torch.randint(0, 100, (2, 12), generator=generator)
-    plain = getattr(model, module).train()
-    again = copy.deepcopy(plain)
-    checkpoint_gradients(again)
-    for network in (plain, again):
-        output = network(ids if module == "text_model" else images)
-        (output if isinstance(output, Tensor) else output[0]).square().mean().backward()
-    torch.testing.assert_close(*({name: p.grad for name, p in one.named_parameters()} for one in (plain, again)))
-    assert any(getattr(part, "gradient_checkpointing", False) for part in again.modules())

@@ -1,6 +1,6 @@
-"""What stages are trained on: data sets in their published layouts, the built-in world, and mixtures of them."""
+"""What stages are trained on: data sets in their published layouts, or the built-in world."""
 
-from unitouch_gen.training.data.cache import computed_once, image_embeddings, weights_hash
+from unitouch_gen.training.data.cache import computed_once
 from unitouch_gen.training.data.columns import DataConfig, Rendered, Source, columns_of, sensor_numbers
 from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.records import Record
@@ -8,5 +8,5 @@ from unitouch_gen.training.data.sets import RecordSet, open_dataset
 
 __all__ = [
     "DataConfig", "DrawnConfig", "DrawnContacts", "Record", "RecordSet", "Rendered", "Source", "columns_of",
-    "computed_once", "image_embeddings", "open_dataset", "sensor_numbers", "weights_hash",
+    "computed_once", "open_dataset", "sensor_numbers",
 ]  # fmt: skip

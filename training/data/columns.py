@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +39,7 @@ class SetConfig(Settings):
 
 
 class DataConfig(Settings):
-    """What a stage is trained on: data sets, the built-in world, or both."""
+    """What a stage is trained on: data sets or the built-in world."""
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None  # contacts of the world
@@ -48,9 +48,9 @@ class DataConfig(Settings):
     audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
     def sources(self) -> list[Source]:
-        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
-        if self.drawn is None and not self.sets:
-            raise InvalidInputError("`data` names nothing to learn; give it `sets`, as [{path: FOLDER}], or `drawn`.")
+        """All there is to train on, yet to be rendered or decoded: contacts or data sets of one sensor each."""
+        if (self.drawn is None) == (not self.sets):
+            raise InvalidInputError("`data` takes one of the two: `sets`, as [{path: FOLDER}], or `drawn`.")
         sources: list[Source] = [*self.drawn.sources()] if self.drawn else []
         for one in self.sets:
             data = open_dataset(one.path, **one.model_dump(exclude={"path", "split"}))
@@ -99,7 +99,7 @@ def columns_of(
         if lacking or len(data) < 2:
             wrong = f"no {few(lacking)}" if lacking else "a single record, where two are the least"
             raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
-    if config.touch_size not in (None, processor.image_size) and not all(isinstance(one, RecordSet) for one in sources):
+    if config.touch_size not in (None, processor.image_size) and config.drawn is not None:
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
     return [
         decoded(cache, source, processor, needs, config.touch_size)
@@ -112,7 +112,7 @@ def columns_of(
 def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Rendered:
     """Renders a split of the world if the cache does not hold it yet, and opens it."""
     material, size, mel = source.contacts(split)[0].numpy(), processor.image_size, processor.audio
-    fingerprint, settings = f"{source.fingerprint(split)}-{size}", {"audio": asdict(mel)}
+    fingerprint = f"{source.fingerprint(split)}-{size}-{hashlib.sha256(str(mel).encode()).hexdigest()[:8]}"
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
     columns: dict[str, tuple[Any, ...]] = {
         **dict.fromkeys(("image", "touch", "second"), (np.uint8, 3, size, size)),
@@ -132,11 +132,8 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
                 arrays[name][len(text) : len(text) + len(values)] = values
             text += scene.text
         (place / "text.json").write_text(json.dumps(text))
-        (place / "settings.json").write_text(json.dumps(settings))
 
     arrays: Any = mapped(folder, len(material), columns, write)
-    if json.loads((folder / "settings.json").read_text()) != settings:
-        raise InvalidInputError(f"`cache` holds {str(folder)!r} with other settings of sounds; delete it.")
     text = json.loads((folder / "text.json").read_text())
     return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
 

@@ -1,20 +1,16 @@
 """Records, each a touch with all that is known of it; and what layouts of data sets find and read them with."""
 
-import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import files_below, is_hidden, natural
 from unitouch_gen.models.images import load_images
-from unitouch_gen.models.videos import read_video
 
 IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}  # suffixes
 
@@ -24,19 +20,16 @@ class Frame:
     """An image in a file."""
 
     path: str
-    index: int | None = None  # in a video, the number of the frame, from 0 in the order in which frames are shown
     key: str | None = None  # in an HDF5 file, the name of the array (H, W, 3)
 
     def read(self) -> Tensor:
         """Pixels (3, H, W): uint8, or float32 in [0, 1]; raises an `InvalidInputError` if they cannot be read."""
         source: Any = self.path
         try:
-            if self.index is not None:
-                source = open_video(self.path, threading.get_ident()).frame(self.index)
-            elif self.key is not None:
+            if self.key is not None:
                 with needed("h5py").File(self.path) as file:
                     source = file[self.key][()]
-        except (OSError, LookupError, ValueError) as error:  # PyAV's and h5py's are among these
+        except (OSError, LookupError, ValueError) as error:  # h5py's are among these
             raise InvalidInputError(f"{self.path!r} cannot be read: {first_line(error)}.") from error
         return load_images("image", source)[0]
 
@@ -91,33 +84,3 @@ def column_of(file: Path, columns: Iterable[str], known: Sequence[str]) -> str:
         if name in columns:
             return name
     raise InvalidInputError(f"{str(file)!r} has the columns {list(columns)}, and none of {', '.join(known)}.")
-
-
-@lru_cache(maxsize=64)  # two for each thread, as a recording has two
-def open_video(path: str, thread: int) -> "Video":
-    """A video that is read in one thread alone."""
-    return Video(path)
-
-
-class Video:
-    """A video that is read forwards, and from its beginning for a frame that is behind."""
-
-    def __init__(self, path: str):
-        self.path, self.place = path, -1  # number of the frame that was read last
-        self.frames: Iterator[np.ndarray] = iter(())
-
-    def frame(self, index: int) -> np.ndarray:
-        """Pixels (H, W, 3) of a frame by its number."""
-        if self.place < 0 or index <= self.place:
-            self.frames, self.place = read_video("video", self.path), -1
-        for pixels in self.frames:
-            self.place += 1
-            if self.place == index:
-                return pixels
-        raise ValueError(f"the video has {self.place + 1} frames, but not number {index}")
-
-
-def frames_in(path: str) -> int:
-    """Number of a video's frames."""
-    with needed("av").open(path) as container:
-        return sum(packet.pts is not None for packet in container.demux(video=0))

@@ -3,18 +3,13 @@
     label.txt  train.txt  test.txt              20220601_182052/0000033833.jpg,3
     train_rough.txt  test_rough.txt             the same with 0 or 1
     dataset/20220601_182052/{video,gelsight}_frame/0000033833.jpg
-    dataset/20220601_182052/{video.mp4,gelsight.mp4,time1.npy,time2.npy}
 
-A recording has its frames as images, or as videos: the touch is then the GelSight's frame of that number, and the
-picture the camera's nearest in time (`time1.npy` holds the camera's Unix seconds, `time2.npy` the GelSight's), or of
-the same number where there are no times.
+Frames are images, as the authors' `extract_frame.py` makes them of each recording's `video.mp4` and `gelsight.mp4`.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_text
@@ -36,8 +31,8 @@ def read(folder: Path) -> Iterator[Record | str]:
     if both := sorted(train.keys() & test.keys()):
         raise InvalidInputError(f"train.txt and test.txt both list {few(both)}.")
     labels = every | train | test
-    clocks = {name: found(folder / "dataset" / name, "time[12].npy") for name in {one.split("/")[0] for one in labels}}
-    times = {name: [np.load(file, allow_pickle=False) for file in files] for name, files in clocks.items()}
+    if labels and not found(folder, "dataset/*/gelsight_frame"):
+        raise InvalidInputError("there are videos alone; run the data set's own `python extract_frame.py` first.")
     for frame, material in labels.items():
         if material < 0:
             continue
@@ -45,21 +40,10 @@ def read(folder: Path) -> Iterator[Record | str]:
         numbers = {"material": material, "soft": int(material in SOFT), "rough": rough.get(frame, -1)}
         names = {label: CLASSES[label][number] for label, number in numbers.items() if number >= 0}
         split = "train" if frame in train else "test" if frame in test else None
-        touch, picture = frames_of(folder / "dataset" / name, file, times[name])
+        touch, picture = (Frame(str(folder / "dataset" / name / of / file)) for of in ("gelsight_frame", "video_frame"))
         yield Record(frame, touch, picture, sensor="gelsight", recording=name, labels=names, split=split)
     if skipped := sum(material < 0 for material in labels.values()):
         yield f"{skipped} frames whose material is inconclusive (-1) are left out"
-
-
-def frames_of(recording: Path, name: str, times: Sequence[np.ndarray]) -> tuple[Frame, Frame]:
-    """The touch and the picture of a frame by its name in the lists; `times` are the camera's and the GelSight's."""
-    touch, picture = recording / "gelsight_frame" / name, recording / "video_frame" / name
-    if touch.parent.is_dir():
-        return Frame(str(touch)), Frame(str(picture))
-    number = nearest = int(touch.stem)
-    if len(times) == 2:
-        nearest = int(np.abs(times[0] - times[1][number]).argmin())
-    return Frame(str(recording / "gelsight.mp4"), index=number), Frame(str(recording / "video.mp4"), index=nearest)
 
 
 def read_list(file: Path) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
@@ -12,7 +12,7 @@ from typer import Argument, Option, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, kind_of, load_joint_space, load_pipeline
+from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import write_file
 
@@ -32,13 +32,13 @@ PIPELINES = {**{name: name for name in GENERATED}, "caption": "touch-to-text"}
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
 
-Figures = dict[str, dict[str, list[float]]]
-"""By row and column, one for each world."""
+Rows = dict[str, dict[str, list[float]]]
+"""Figures by row and column, one for each world."""
 
 
 def evaluate(
-    table: Annotated[str, Argument(help=f"{', '.join(TABLES)}; or all that there can be.")],
-    output: Annotated[Path | None, Option("--output", "-o", help="Folder for JSON and Markdown.")] = None,
+    table: Annotated[str, Argument(help=f"{', '.join(TABLES)}.")],
+    output: Annotated[Path | None, Option("--output", "-o", help="Folder for TABLE.json.")] = None,
     model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
     data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
     kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
@@ -47,54 +47,40 @@ def evaluate(
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
-    judge: Annotated[Path | None, Option(help="Folder of a language model that rates captions from 1 to 5.")] = None,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False,
 ) -> None:  # fmt: skip
-    """Makes tables of the paper, each figure beside chance, majority, plain statistics and an untrained encoder.
+    """Makes a table of the paper, each figure beside chance, majority, plain statistics and an untrained encoder.
 
     Example: unitouch-gen evaluate material -o tables/
     """
-    check_choice("table", table, (*TABLES, "all"))
-    names = asked_for(table, model)
+    check_choice("table", table, TABLES)
+    if model is not None and table in PIPELINES:
+        kind_of(model, [PIPELINES[table]])
     from unitouch_gen.training.data import open_dataset
     from unitouch_gen.training.data.heldout import of_datasets, of_world
 
     if output is not None:
-        options.check_output([output / f"{name}.json" for name in names], overwrite)
+        options.check_output([output / f"{table}.json"], overwrite)
     given: Any = {"sensor": sensor, "materials": options.by_comma(materials)}
     folders = [open_dataset(folder, kind, **given) for folder in data or ()]
-    pipes = {name: load_pipeline(PIPELINES[name], model=model, device=device) for name in names if name in PIPELINES}
+    pipe = load_pipeline(PIPELINES[table], model=model, device=device) if table in PIPELINES else None
     joint, processor = load_joint_space(model, device)
-    for name in tuple(names):
-        try:
-            check_table(name, joint, pipes.get(name), folders, each)
-        except InvalidInputError as error:
-            if table != "all":
-                raise
-            names.remove(name)
-            options.note(f"No table {name!r}: {error}")
+    check_table(table, joint, pipe, folders, each)
     with TemporaryDirectory(prefix="unitouch-") as scratch:
         place, started = cache or Path(scratch), time.perf_counter()
         if folders:
             sets = of_datasets(place, joint, processor, folders)
         else:
             known = [name for name in NAMED if name in joint.config.sensors]
-            sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
-        made = figures_of(names, sets, joint, processor, pipes, each, judge)
-    facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
-    for name, rows in made.items():
-        show(name, rows, facts, output)
+            sets = of_world(place, joint, processor, known, range(seeds), objects, grasps=table == "grasp")
+        rows = figures_of(table, sets, joint, processor, pipe, each)
+    show(table, rows)
     if output is not None:
-        echo(f"The tables are in {output.resolve()}")
-
-
-def asked_for(table: str, model: str | None) -> list[str]:
-    """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
-    kinds = [*PIPELINES.values()] if model is None else []
-    if model is not None and (table in PIPELINES or (Path(model) / "model_index.json").is_file()):
-        kinds = [kind_of(model, [PIPELINES[table]] if table in PIPELINES else [*CLASSES])]
-    return [table] if table != "all" else [name for name in TABLES if PIPELINES.get(name) in (None, *kinds)]
+        facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
+        content = json.dumps({"table": table, "rows": rows, **facts}, indent=2)
+        write_file("--output", output / f"{table}.json", content + "\n")
+        echo(f"The table is in {output.resolve()}")
 
 
 def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: int) -> None:
@@ -130,10 +116,8 @@ def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: 
             raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
 
 
-def figures_of(
-    names: Sequence[str], sets: Any, joint: Any, processor: Any, pipes: Mapping[str, Any], each: int, judge: Path | None
-) -> dict[str, Figures]:  # fmt: skip
-    """Figures of each table."""
+def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, each: int) -> Rows:
+    """Figures of a table by row and column, one for each world."""
     import torch
 
     from unitouch_gen import weights
@@ -149,45 +133,38 @@ def figures_of(
     judges = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
     asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
     drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
-    made: dict[str, Figures] = {name: {} for name in names}
-    drawn = set[tuple[str, str, int]]()
+    rows: Rows = {}
+    drawn = set[tuple[str, int]]()
     for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
-        for name in names:
-            if name in asking:
-                found = {row: {f"{sensor}, {domain}": share} for row, share in asking[name](splits, embed).items()}
-            elif name == "retrieval":
-                found = tables.retrieval_table(splits)
-            elif name == "caption":
-                found = caption_table(pipes[name], splits, embed, each, judge)
-            else:
-                pipe, felt = pipes[name], {*splits["test"].sensors}
-                if (name, domain, seed) in drawn or (name == "x-to-touch" and not felt <= {*pipe.config.sensors}):
-                    continue
-                drawn.add((name, domain, seed))  # images take time, so they are of one sensor of each domain
-                found = drawing[name](pipe, splits, judges, each, seed)
-            for row, values in found.items():
-                columns = made[name].setdefault(row if name in asking else f"{row}, {domain}", {})
-                for column, value in values.items():
-                    columns.setdefault(column, []).append(value)
-    return made
+        if table in asking:
+            found = {row: {f"{sensor}, {domain}": share} for row, share in asking[table](splits, embed).items()}
+        elif table == "retrieval":
+            found = tables.retrieval_table(splits)
+        elif table == "caption":
+            found = caption_table(pipe, splits, embed, each)
+        else:
+            felt = {*splits["test"].sensors}
+            if (domain, seed) in drawn or (table == "x-to-touch" and not felt <= {*pipe.config.sensors}):
+                continue
+            drawn.add((domain, seed))  # images take time, so they are of one sensor of each domain
+            found = drawing[table](pipe, splits, judges, each, seed)
+        for row, values in found.items():
+            columns = rows.setdefault(row if table in asking else f"{row}, {domain}", {})
+            for column, value in values.items():
+                columns.setdefault(column, []).append(value)
+    return rows
 
 
-def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None) -> None:
-    """Prints a table, and writes NAME.json and NAME.md."""
+def show(table: str, rows: Rows) -> None:
+    """Prints a table: means over worlds, in brackets their spread."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    scale, digits = (1, 2) if name in GENERATED else (100, 1)
+    scale, digits = (1, 2) if table in GENERATED else (100, 1)
 
     def cell(values: Sequence[float]) -> str:
         spread = f" ({scale * (max(values) - min(values)):.{digits}f})" if len(values) > 1 else ""
         return f"{scale * mean(values):.{digits}f}{spread}" if values else ""
 
+    echo(TABLES[table])
     lines = [[row, *(cell(values.get(column, ())) for column in columns)] for row, values in rows.items()]
-    echo(TABLES[name])
     options.print_table(["", *columns], lines)
-    if output is None:
-        return
-    write_file("--output", output / f"{name}.json", json.dumps({"table": name, "rows": rows, **facts}, indent=2) + "\n")
-    cells = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
-    page = [f"## {TABLES[name]}", "", *cells, "", f"Means over worlds, in brackets their spread. {facts}"]
-    write_file("--output", output / f"{name}.md", "\n".join(page) + "\n")

@@ -1,50 +1,35 @@
-"""Answers about touches (Section 4.6 of the paper): the share that is right, and how a language model rates them."""
+"""Answers about touches (Section 4.6 of the paper): the share that is right."""
 
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 from torchmetrics.functional.text import rouge_score
-from transformers import AutoModelForCausalLM, AutoTokenizer
 
 from unitouch_gen.evaluation.contacts import Splits, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import Figures, others
 from unitouch_gen.evaluation.generated import some
 from unitouch_gen.evaluation.metrics import cosines
 from unitouch_gen.evaluation.zero_shot import PROMPTS
-from unitouch_gen.world import MATERIALS
-from unitouch_gen.world.captions import DIRECTION_WORDS, HARDNESS_WORDS, ROUGHNESS_WORDS, SHAPE_WORDS
 from unitouch_gen.world.questions import TOPICS
 
 Asked = Mapping[str, tuple[str, Sequence[str]]]
 """By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
 
-FELT = (
-    *ROUGHNESS_WORDS, *HARDNESS_WORDS, *DIRECTION_WORDS, "regular", "irregular", "fine", "coarse",
-    *(word for words in SHAPE_WORDS.values() for word in words),
-    *(word for material in MATERIALS for word in (material.name, *material.feel)),
-)  # fmt: skip
-"""What captions say that can be felt: all but colours."""
 
-
-def caption_table(
-    pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Tensor], each: int, judge: Path | None = None
-) -> dict[str, Figures]:
+def caption_table(pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Tensor], each: int) -> dict[str, Figures]:
     """Shares of answers that are right, of `each` contacts of every material of the split "test", by row.
 
     Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of hardness and
-    grasps accuracy is balanced over what is true; of grains it is of such as there are. Attributes of captions are
-    right if any true caption has them; ROUGE-L is that to the nearest of these.
+    grasps accuracy is balanced over what is true; of grains it is of such as there are. ROUGE-L of captions is that to
+    the nearest true one.
 
     Args:
         pipe: A `TouchToTextPipeline`.
         embed: Gives unit embeddings of texts, for the zero-shot classifier.
-        judge: Folder of a causal language model that rates captions from 1 to 5; see `rated`.
     """
     test = splits["test"]
     names, rows = test.classes.get("material", ()), some(test, each)
@@ -61,7 +46,7 @@ def caption_table(
     }
     for row, values in embeds.items():
         answers[row] = {topic: answered(pipe, values, [one[topic][0] for one in asked]) for topic in asked[0]}
-    figures = {row: measured(asked, found, names, judge) for row, found in answers.items()}
+    figures = {row: measured(asked, found, names) for row, found in answers.items()}
     if "material" in asked[0]:
         classes = embed([PROMPTS["touch"].format(name) for name in names])
         found = cosines(test.features["touch"][rows], classes).argmax(dim=1)
@@ -77,9 +62,7 @@ def answered(pipe: Any, embeds: Tensor, questions: Sequence[str]) -> list[str]:
     return found
 
 
-def measured(
-    asked: Sequence[Asked], answers: Mapping[str, Sequence[str]], materials: Sequence[str], judge: Path | None = None
-) -> Figures:
+def measured(asked: Sequence[Asked], answers: Mapping[str, Sequence[str]], materials: Sequence[str]) -> Figures:
     """Figures of answers by topic, each to one of the questions that were asked."""
     figures = Figures()
     for name, topic in TOPICS.items():
@@ -93,15 +76,8 @@ def measured(
         figures[topic.figure] = sum(sum(found) / len(found) for found in groups) / len(groups)
     if "caption" in answers:
         true = [list(one["caption"][1]) for one in asked]
-        shares = []
-        for references, text in zip(true, answers["caption"], strict=True):
-            said = attributes_of(text)
-            shares.append(len(said & attributes_of(" ".join(references))) / max(1, len(said)))
-        figures["caption's attributes"] = sum(shares) / len(shares)
         scores = rouge_score(list(answers["caption"]), true, accumulate="best", rouge_keys="rougeL")
         figures["ROUGE-L"] = float(scores["rougeL_fmeasure"])
-        if judge is not None:
-            figures["rating"] = sum(rated(judge, [one[0] for one in true], answers["caption"])) / len(true)
     return figures
 
 
@@ -109,23 +85,3 @@ def class_of(text: str, words: Mapping[str, str]) -> str | None:
     """The class that the first of some words in a text stands for; `None` if the text has none of them."""
     found = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
     return words[found[0]] if found else None
-
-
-def attributes_of(text: str) -> set[str]:
-    """The words of `FELT` in a text, the longest where one holds another."""
-    longest = "|".join(sorted(map(re.escape, FELT), key=len, reverse=True))
-    return set(re.findall(rf"\b(?:{longest})\b", text))
-
-
-@torch.no_grad()
-def rated(judge: Path, truths: Sequence[str], answers: Sequence[str]) -> list[float]:
-    """Ratings from 1, wrong, to 5 by a causal language model of a folder: the mean over its next token's digits."""
-    tokenizer = AutoTokenizer.from_pretrained(judge)
-    model = AutoModelForCausalLM.from_pretrained(judge, use_safetensors=True).eval()
-    template = Path(__file__).with_name("rating.txt").read_text()  # asks for a number for {answer}, if {truth} is true
-    digits, found = tokenizer.convert_tokens_to_ids(list("12345")), list[float]()
-    for truth, answer in zip(truths, answers, strict=True):
-        ids = tokenizer(template.format(truth=truth, answer=answer), return_tensors="pt")["input_ids"]
-        shares = model(ids).logits[0, -1, digits].float().softmax(dim=0)
-        found.append(float(shares @ torch.arange(1.0, 6.0)))
-    return found

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from unitouch_gen.evaluation.controls import relief_statistics, statistics, untrained_like
+from unitouch_gen.evaluation.controls import statistics, untrained_like
 from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
@@ -75,8 +75,8 @@ def embed(
     """Features (N, D) of contacts by name.
 
     Of the joint space: "touch", and "image", "audio" and "text" where contacts and model have them. Controls: plain
-    "statistics" of the touch and of its "relief", an "untrained" encoder, the untouched "gel", and "supervised", a
-    classifier of touches trained with labels.
+    "statistics" of the touch, an "untrained" encoder, the untouched "gel", and "supervised", a classifier of touches
+    trained with labels.
     """
     touch, gel, sensors, known = contacts.touch, contacts.gel, contacts.sensors, model.known_modalities
     at_rest = np.broadcast_to(np.mean(touch, axis=0, dtype=np.float32), touch.shape) if gel is None else gel
@@ -92,7 +92,6 @@ def embed(
         "touch": image_embeddings(model, "touch", touch, sensors),
         "untrained": image_embeddings(untrained_like(model), "touch", touch, sensors),
         "statistics": in_batches(len(touch), plain),
-        "relief": in_batches(len(touch), lambda rows: relief_statistics(float_pixels(touch[rows]))),
         "supervised": in_batches(len(touch), lambda rows: classifier.observe(float_pixels(touch[rows])).features),
     }
     if gel is not None:

@@ -8,8 +8,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.relief import relief
 
 Figures = dict[str, float]  # measured values by name
 
@@ -62,11 +60,6 @@ def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
         colours = difference.reshape(-1, 3)
         rows.append([*row, *colours.mean(axis=0), *colours.std(axis=0)])
     return np.array(rows, dtype=np.float64)
-
-
-def relief_statistics(touches: Tensor) -> np.ndarray:
-    """`statistics` of the relief that is read off the colours of touches (N, 3, H, W) in [0, 1], float64 (N, 22)."""
-    return statistics([128.0 + 20.0 * one for one in relief(normalise_pixels(touches)).movedim(1, -1).numpy()])
 
 
 def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:

@@ -17,7 +17,6 @@ Embed = Callable[[Sequence[str]], Tensor]  # unit embeddings (N, D) of texts
 PROBED = {  # rows of linear probes, by features
     "gel": "untouched gel, probe",
     "statistics": "plain statistics, probe",
-    "relief": "statistics of the relief, probe",
     "untrained": "untrained encoder, probe",
     "supervised": "supervised classifier of touches, probe",
     "touch": "touch encoder, probe",

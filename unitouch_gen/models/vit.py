@@ -13,7 +13,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from transformers.models.clip.modeling_clip import CLIPVisionEmbeddings
 
@@ -138,12 +137,7 @@ class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
     Behind the stems "residual" and "relief" the class token begins at the mean of the patches.
-
-    Attributes:
-        gradient_checkpointing: Whether training recomputes the blocks in the backward pass, to save memory.
     """
-
-    gradient_checkpointing = False
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
@@ -189,8 +183,7 @@ class UniTouchViT(nn.Module):
         if prefix is not None:
             x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
         for block in self.blocks:
-            again = self.gradient_checkpointing and self.training
-            x = checkpoint(block, x, use_reentrant=False) if again else block(x)
+            x = block(x)
         return x
 
 

@@ -12,9 +12,8 @@ from PIL import Image
 from tests.helpers.data_sets import RED, write_image
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.__main__ import app
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings, open_dataset
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of, computed_once, open_dataset
 
 
 @pytest.fixture
@@ -73,17 +72,10 @@ def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, 
     assert np.abs(after.touch[3].reshape(3, -1).mean(axis=1) - RED).max() < 1
 
 
-def test_embeddings_are_the_encoders_and_computed_once_for_its_weights(model: UniTouchModel, tmp_path: Path) -> None:
-    pictures = np.random.default_rng(0).integers(0, 256, (7, 3, 32, 32), dtype=np.uint8)
-    embeds = image_embeddings(model, [pictures[:4], pictures[4:]], "k", tmp_path, batch_size=3)
-    with torch.no_grad():
-        expected = model.get_image_features(normalise_pixels(torch.from_numpy(pictures) / 255.0))
-    torch.testing.assert_close(embeds, expected)
-    assert torch.equal(image_embeddings(model, [], "k", tmp_path), embeds)  # no picture is looked at
-    assert len(image_embeddings(model, [pictures[:2]], "other", tmp_path)) == 2
-    with torch.no_grad():
-        model.vision_model.visual_projection.weight[3, 5] += 1.0
-    assert not torch.equal(image_embeddings(model, [pictures], "k", tmp_path), embeds)
+def test_what_is_in_the_cache_is_not_computed_again(tmp_path: Path) -> None:
+    values, file = torch.rand(7, 3), tmp_path / "cache" / "values.safetensors"
+    assert torch.equal(computed_once(file, lambda: values), values)
+    assert torch.equal(computed_once(file, pytest.fail), values)
 
 
 def test_broken_files_are_refused_in_a_list_and_leave_no_cache(folder, tmp_path, processor) -> None:

@@ -87,13 +87,16 @@ def test_what_is_cached_is_mapped_and_the_same(splits, place, processor, tmp_pat
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
-@pytest.mark.usefixtures("splits")
-def test_other_sizes_are_rendered_anew_and_other_sounds_refused(place: Path, processor: UniTouchProcessor) -> None:
+def test_other_sizes_and_sounds_are_rendered_anew(splits, place: Path, processor: UniTouchProcessor) -> None:
     processor.image_size = 16
     [small] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
-    assert small.touch.shape[-1] == 16 and small.fingerprint.endswith("-16")
-    processor.image_size, processor.audio = 32, replace(processor.audio, mean=-3.0)
-    with pytest.raises(InvalidInputError, match=r"`cache` holds .*drawn-any-train.* with other settings of sounds"):
-        columns_of(SOURCES[:1], place, CONFIG, processor, ())
+    assert small.touch.shape[-1] == 16
+    before, processor.image_size = processor.audio, 32
+    processor.audio = replace(before, mean=before.mean + 1.0)
+    [heard] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
+    np.testing.assert_allclose(heard.audio, splits[0].audio - 1.0 / before.std, atol=1e-2)
+    assert len({small.fingerprint, heard.fingerprint, splits[0].fingerprint}) == 3
+    with pytest.raises(InvalidInputError, match="takes one of the two"):
+        DataConfig(drawn=CONFIG.drawn, sets=[{"path": str(place)}]).sources()
     with pytest.raises(InvalidInputError, match="`touch_size` is 64; with drawn sensors"):
         columns_of(SOURCES[:1], place, CONFIG.model_copy(update={"touch_size": 64}), processor, ())

@@ -63,7 +63,7 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp
     [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
     assert not known and [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
     test, record = splits["test"], parts_of(data)["test"].records[1]
-    assert set(test.features) == {"touch", "untrained", "statistics", "relief", "supervised", "gel", "text"}
+    assert set(test.features) == {"touch", "untrained", "statistics", "supervised", "gel", "text"}
     assert test.labels["hardness"].tolist() == [record.labels["hardness"]] * 2
     touch, gel = (np.asarray(Image.open(folder / record.id.replace("peak", kind)), float) for kind in ("peak", "bg"))
     np.testing.assert_allclose(test.features["statistics"][1], statistics([touch - gel])[0], atol=1e-3)

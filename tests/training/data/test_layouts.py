@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.helpers.data_sets import painted, shade, write_attempts, write_image, write_video
+from tests.helpers.data_sets import painted, shade, write_attempts, write_image
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import RecordSet, open_dataset
 from unitouch_gen.training.data.records import Frame
@@ -76,7 +74,7 @@ def ycb_slide(folder: Path) -> None:
     run = "real/035_drill/dataset_0"
     write(folder, {f"sim/004_box/00/tactile_images/{number}.jpg": number for number in (2, 10)})
     write(folder, {f"{run}/frames/frame_7.jpg": 1, f"{run}/webcam_frames/frame_7.jpg": 2})
-    write_video(folder / "real/004_box/dataset_1/frames.mp4", [shade(20), shade(21)])
+    write(folder, {f"real/004_box/dataset_1/frames/frame_{number}.jpg": 20 + number for number in (0, 1)})
 
 
 def object_folder(folder: Path) -> None:
@@ -146,8 +144,8 @@ LAYOUTS: dict[Callable, tuple[int, str]] = {
         000/i10/A 10 50 60 gelsight object_10 000/i10 - grasp=lifted
         001/i0/B 32 52 60 gelsight object_12 001/i0 - grasp=lifted"""),
     ycb_slide: (5, """
-        digit/004_box/dataset_1/frame_0000000.jpg 20 - - digit 004_box digit/004_box/dataset_1 - material=box
-        digit/004_box/dataset_1/frame_0000001.jpg 21 - - digit 004_box digit/004_box/dataset_1 - material=box
+        digit/004_box/dataset_1/frame_0.jpg 20 - - digit 004_box digit/004_box/dataset_1 - material=box
+        digit/004_box/dataset_1/frame_1.jpg 21 - - digit 004_box digit/004_box/dataset_1 - material=box
         digit/035_drill/dataset_0/frame_7.jpg 1 2 - digit 035_drill digit/035_drill/dataset_0 - material=drill
         tacto/004_box/00/2.jpg 2 - - tacto 004_box tacto/004_box/00 - material=box
         tacto/004_box/00/10.jpg 10 - - tacto 004_box tacto/004_box/00 - material=box"""),
@@ -215,32 +213,10 @@ def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
     assert len(open_dataset(tmp_path)) == 4  # without a split all points are there
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(write_video(tmp_path_factory.mktemp("video") / "gelsight.mp4", [shade(number) for number in range(24)]))
-
-
-@settings(max_examples=25, deadline=None)
-@given(order=st.lists(st.integers(0, 23), min_size=1, max_size=12))
-def test_frames_of_a_video_are_the_same_in_any_order(order: list[int], video: str) -> None:
-    assert [number_of(Frame(video, index=number)) for number in order] == order
-
-
-@pytest.mark.parametrize("timed", [True, False])
-def test_touch_and_picture_of_videos_are_paired_by_time_or_number(timed: bool, tmp_path: Path) -> None:
-    place = tmp_path / "dataset" / ONE
-    write_video(place / "gelsight.mp4", [shade(number) for number in range(12)])
-    write_video(place / "video.mp4", [shade(20 + number) for number in range(12)], rate=15)
-    if timed:  # the camera began three frames later, at half the rate
-        np.save(place / "time2.npy", 1.654e9 + np.arange(12) / 30)
-        np.save(place / "time1.npy", 1.654e9 + 0.1 + np.arange(12) / 15)
-    write(tmp_path, {"label.txt": "".join(f"{ONE}/{number:010d}.jpg,1\n" for number in (11, 0, 7, 3))})
-    pairs = {number_of(one.touch): number_of(one.picture) - 20 for one in open_dataset(tmp_path).records}
-    assert pairs == ({0: 0, 3: 0, 7: 2, 11: 4} if timed else {number: number for number in (0, 3, 7, 11)})
-
-
 BROKEN = [
-    (touch_and_go, {f"dataset/{ONE}/gelsight_frame": None}, r"2 of 6 files are not there:.*gelsight\.mp4;.*video\.mp4"),
+    (touch_and_go, {f"dataset/{ONE}/gelsight_frame": None}, r"1 of 6 files are not there: .*gelsight_frame/0+\.jpg"),
+    (touch_and_go, {f"dataset/{name}/gelsight_frame": None for name in (ONE, TWO, THREE)}, r"run .* extract_frame\.py"),
+    (ycb_slide, {"real/004_box/dataset_1/frames": None}, r"has no images; .* run: .*ffmpeg"),
     (touch_and_go, {"test.txt": f"{ONE}/0000000000.jpg,3\n"}, r"train.txt and test.txt both list .*00\.jpg"),
     (touch_and_go, {"label.txt": f"{ONE}/0.jpg;3\n"}, r"label\.txt' has '.*;3'; a line is recording/frame"),
     (feeling_of_success, {"calandra_corl2017_001.h5": "gone"}, r"_001\.h5' is no list of attempts"),
