@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from diffusers import DDPMScheduler, DEISMultistepScheduler, UniPCMultistepScheduler
+from diffusers import DDPMScheduler, DEISMultistepScheduler, EulerAncestralDiscreteScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
@@ -24,10 +24,10 @@ TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "defau
                   "default_noise_level": 150}  # fmt: skip
 STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best beside the embedding bank
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
-# Of diffusers' multistep schedulers and spacings, these do best in those numbers of steps.
-SCHEDULERS: dict[str, tuple[Any, str]] = {
-    "touch-to-image": (DEISMultistepScheduler, "use_karras_sigmas"),
-    "x-to-touch": (UniPCMultistepScheduler, "use_exponential_sigmas"),
+# These do best in those numbers of steps. Noise that is added between steps brings touches' variety back.
+SCHEDULERS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "touch-to-image": (DEISMultistepScheduler, {"use_karras_sigmas": True}),
+    "x-to-touch": (EulerAncestralDiscreteScheduler, {}),
 }
 
 PLACES = {
@@ -92,9 +92,9 @@ def assemble(
         sensors.unlink()
         for name, settings in defaults.items():
             write_json(settings, place / name / "defaults.json")
-        for name, (kind, spacing) in SCHEDULERS.items():
+        for name, (kind, options) in SCHEDULERS.items():
             config = DDPMScheduler.from_pretrained(place / name / "scheduler").config
-            scheduler = kind(**{key: config[key] for key in TRAINED}, **{spacing: True})
+            scheduler = kind(**{key: config[key] for key in TRAINED}, **options)
             scheduler.save_pretrained(place / name / "scheduler")
         halve(place)
         write_json({"training": records, "figures": {}}, place / "family.json")
