@@ -123,7 +123,7 @@ def _read_published(
         keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, model.source).items()}
         for modality in FILES[name]:
             tensors = _encoder_in(f"`{name}` names {str(file)!r}, which", keys, config, modality)
-            if not model.loaded_modalities:
+            if not model.known_modalities:
                 model.to(dtype or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
     return model
@@ -241,8 +241,8 @@ def convert_published(
     model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
-    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
-    lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
+    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
+    lacks += ["sensor tokens, which were not published"] if "touch" in model.known_modalities else []
     if not words:
         lacks.append("a tokenizer, which `tokenizer` would bring")
     with writing_folder("output", output) as folder:
