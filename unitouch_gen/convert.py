@@ -58,9 +58,7 @@ VIT: tuple[Renaming, ...] = (
     (r"position", r"modality_preprocessors.M.pos_embedding_helper.pos_embed", SAME),
     (rf"stem_norm{_END}", r"modality_preprocessors.M.rgbt_stem.norm_layer.\1", SAME),
     (rf"{_BLOCK}\.(norm_[12]){_END}", r"modality_trunks.M.blocks.\1.\2.\3", SAME),
-    (rf"{_BLOCK}\.attention\.qkv{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", SAME),
-    (rf"{_BLOCK}\.attention\.out{_END}", r"modality_trunks.M.blocks.\1.attn.out_proj.\2", SAME),
-    (rf"{_BLOCK}\.attention\.(bias_[kv])", r"modality_trunks.M.blocks.\1.attn.\2", SAME),
+    (rf"{_BLOCK}\.attention\.(.+)", r"modality_trunks.M.blocks.\1.attn.\2", SAME),
     (rf"{_BLOCK}\.mlp\.0{_END}", r"modality_trunks.M.blocks.\1.mlp.fc1.\2", SAME),
     (rf"{_BLOCK}\.mlp\.2{_END}", r"modality_trunks.M.blocks.\1.mlp.fc2.\2", SAME),
     (rf"norm{_END}", r"modality_heads.M.0.\1", SAME),
@@ -125,7 +123,7 @@ def _read_published(
         keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, model.source).items()}
         for modality in FILES[name]:
             tensors = _encoder_in(f"`{name}` names {str(file)!r}, which", keys, config, modality)
-            if not model.loaded_modalities:
+            if not model.known_modalities:
                 model.to(dtype or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
     return model
@@ -243,8 +241,8 @@ def convert_published(
     model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
-    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
-    lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
+    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
+    lacks += ["sensor tokens, which were not published"] if "touch" in model.known_modalities else []
     if not words:
         lacks.append("a tokenizer, which `tokenizer` would bring")
     with writing_folder("output", output) as folder:

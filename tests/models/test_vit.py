@@ -35,10 +35,8 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
     for i in range(config.num_hidden_layers):
         attention = nn.MultiheadAttention(width, config.num_attention_heads, add_bias_kv=config.add_bias_kv,
                                           batch_first=True, dtype=pixels.dtype).eval()  # fmt: skip
-        names = {"in_proj_weight": "qkv.weight", "in_proj_bias": "qkv.bias", "out_proj.weight": "out.weight",
-                 "out_proj.bias": "out.bias"}  # fmt: skip
-        names |= {"bias_k": "bias_k", "bias_v": "bias_v"} if config.add_bias_kv else {}
-        attention.load_state_dict({theirs: weights[f"blocks.{i}.attention.{ours}"] for theirs, ours in names.items()})
+        place = f"blocks.{i}.attention."
+        attention.load_state_dict({key.removeprefix(place): weights[key] for key in weights if key.startswith(place)})
         normed = norm(x, f"blocks.{i}.norm_1")
         x = x + attention(normed, normed, normed, need_weights=False)[0]
         up, down = ([weights[f"blocks.{i}.mlp.{layer}.{part}"] for part in ("weight", "bias")] for layer in (0, 2))

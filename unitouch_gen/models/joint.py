@@ -165,11 +165,6 @@ class UniTouchModel(PreTrainedModel):
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
     @property
-    def loaded_modalities(self) -> tuple[str, ...]:
-        """Modalities whose encoders are in memory."""
-        return tuple(modality for modality in MODALITIES if MODULES[modality][0] in self._modules)
-
-    @property
     def known_modalities(self) -> tuple[str, ...]:
         """Modalities whose encoders are in memory or can be read."""
         modules = {*self._modules, *(key.partition(".")[0] for key in self._stored)}

@@ -57,9 +57,6 @@ class SensorBank(nn.Module):
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
         self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))  # which have a prototype
 
-    def __len__(self) -> int:
-        return len(self.names)
-
     def index(self, name: str) -> int:
         """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
         if not self.names:

@@ -21,29 +21,6 @@ from unitouch_gen.models.images import local_mean
 from unitouch_gen.models.relief import RELIEF_CHANNELS, BesideRelief
 
 
-class Attention(nn.Module):
-    """Multi-head self-attention with an optional learned key and value."""
-
-    def __init__(self, config: UniTouchViTConfig):
-        super().__init__()
-        width = config.hidden_size
-        self.heads = config.num_attention_heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-        self.bias_k = nn.Parameter(torch.zeros(1, 1, width)) if config.add_bias_kv else None
-        self.bias_v = nn.Parameter(torch.zeros(1, 1, width)) if config.add_bias_kv else None
-
-    def forward(self, x: Tensor) -> Tensor:  # (B, T, width)
-        batch = len(x)
-        q, k, v = self.qkv(x).chunk(3, dim=-1)
-        if self.bias_k is not None and self.bias_v is not None:
-            k = torch.cat([k, self.bias_k.to(k.dtype).expand(batch, -1, -1)], dim=1)
-            v = torch.cat([v, self.bias_v.to(v.dtype).expand(batch, -1, -1)], dim=1)
-        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))
-        y = F.scaled_dot_product_attention(q, k, v)  # (B, nh, T, hs)
-        return self.out(y.transpose(1, 2).flatten(2))
-
-
 class StreamNorm(nn.LayerNorm):
     """A norm of the residual stream: computed in the stream's dtype, returned in the weights'."""
 
@@ -59,12 +36,14 @@ class Block(nn.Module):
         super().__init__()
         width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
         self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
-        self.attention = Attention(config)
+        heads, bias = config.num_attention_heads, config.add_bias_kv
+        self.attention = nn.MultiheadAttention(width, heads, add_bias_kv=bias, batch_first=True)
         self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x + self.attention(self.norm_1(x))
+        normed = self.norm_1(x)
+        x = x + self.attention(normed, normed, normed, need_weights=False)[0]
         return x + self.mlp(self.norm_2(x))
 
 
@@ -202,7 +181,7 @@ def initialise(module: nn.Module) -> None:
         nn.init.trunc_normal_(module.weight, std=std)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-    for name in ("bias_k", "bias_v", "class_token", "position"):
+    for name in ("in_proj_weight", "bias_k", "bias_v", "class_token", "position"):
         if isinstance(token := getattr(module, name, None), nn.Parameter):
             nn.init.trunc_normal_(token, std=0.02)
 
