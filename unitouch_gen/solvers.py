@@ -71,23 +71,6 @@ def sample_dpmpp_2m(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_
     return x
 
 
-def sample_deis(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """DEIS of order 2: the slope is extrapolated linearly in log sigma (Zhang & Chen, 2023, Equation 15)."""
-    levels: Levels = []
-    previous = torch.zeros_like(x)  # slope of the step before
-    for step, (sigma, target) in enumerate(pairwise(sigmas)):
-        levels.append((sigma, denoised := denoise(x, sigma)))
-        if target == 0.0:
-            return after_step(step, denoised_at_zero(levels), target)
-        slope = (x - denoised) / sigma
-        x = x + (target - sigma) * slope
-        if step > 0:
-            rise = (slope - previous) / math.log(sigma / levels[-2][0])
-            x = x + (target * math.log(target / sigma) - (target - sigma)) * rise
-        x, previous = after_step(step, x, target), slope
-    return x
-
-
 def sample_unipc(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
     """UniPC with B_2(h), of order 3 (Zhao et al., 2023, Algorithms 1 and 2): DPM-Solver++(2M) predictor; the corrector
     reuses the evaluation at the predicted point."""
@@ -227,5 +210,4 @@ SOLVERS: dict[str, Solver] = {
     "heun": Solver(sample_heun, 2, NoiseSchedule.karras),
     "dpm++2m": Solver(sample_dpmpp_2m, 2, NoiseSchedule.karras),
     "unipc": Solver(sample_unipc, 3, NoiseSchedule.karras),
-    "deis": Solver(sample_deis, 2, NoiseSchedule.karras),
 }

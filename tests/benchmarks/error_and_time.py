@@ -97,7 +97,7 @@ def cost_figures(
     Where none has it, it is left out.
     """
     target = pipeline_target(pipe, inputs, seeds=seeds)
-    solvers = ("unipc", "dpm++2m", "deis")
+    solvers = ("unipc", "dpm++2m")
     front = pareto_front([measure(target, name, n, repeats=1) for name in solvers for n in steps], "evaluations")
     found = {f"{error:g}": [row for row in front if row["error"] <= error] for error in wanted}
     costs = {error: {key: rows[0][key] for key in OF_ROWS} for error, rows in found.items() if rows}

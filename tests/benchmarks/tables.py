@@ -172,7 +172,7 @@ def cost_table(figures: Figures) -> str:
     counts = sorted({each["conditions"] for each in pipelines.values()})
     note = (
         f"Median error of the latents over {' and '.join(map(str, counts))} samples of held-out contacts, relative to "
-        "the exact flow of the network; the fewest steps of `unipc`, `dpm++2m` and `deis`."
+        "the exact flow of the network; the fewest steps of `unipc` and `dpm++2m`."
     )
     return table(["error", *heads], rows, note)
 

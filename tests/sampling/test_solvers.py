@@ -14,9 +14,6 @@ from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedule import NoiseSchedule, alpha
 from unitouch_gen.solvers import SOLVERS, denoised_at_zero, exponential_integral, sample_ddim
 
-# numpy 2 on diffusers' DEIS.
-pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
-
 MIXTURE, GAUSSIAN = PROBLEMS["mixture"], PROBLEMS["gaussian"]
 NOISE = MIXTURE.noise(3).float()
 KARRAS = {**STABLE_DIFFUSION, "use_karras_sigmas": True, "timestep_spacing": "linspace"}
@@ -25,7 +22,6 @@ THEIRS = {
     "heun": diffusers.HeunDiscreteScheduler(**KARRAS),
     "dpm++2m": diffusers.DPMSolverMultistepScheduler(**KARRAS, solver_order=2),
     "unipc": diffusers.UniPCMultistepScheduler(**KARRAS, solver_order=2, solver_type="bh2"),
-    "deis": diffusers.DEISMultistepScheduler(**KARRAS, solver_order=2),
 }
 
 
