@@ -14,12 +14,12 @@ from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from assemble_family import assemble
 from tests.helpers.components import AUDIO, SPACE
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.__main__ import app
-from unitouch_gen.training.assemble import assemble
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import STAGES, Stage, command_of, weights_of
 from unitouch_gen.training.touch import TouchRecipe
@@ -117,7 +117,7 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
 
 @pytest.fixture(scope="module")
 def family(runs: Path) -> Path:
-    assemble(runs=runs, output=runs / "family")
+    assemble(runs, runs / "family")
     return runs / "family"
 
 
@@ -158,10 +158,10 @@ def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_oth
     vae = tmp_path / "runs" / "image_vae"
     save_file({"weight": torch.ones(2)}, next((vae / "model").glob("*.safetensors")))
     with pytest.raises(InvalidInputError, match="unclip', which was built on other weights than image_vae holds now"):
-        assemble(runs=tmp_path / "runs", output=family)
+        assemble(tmp_path / "runs", family)
     (vae / "record.json").unlink()
     with pytest.raises(InvalidInputError, match=r"lacks .*image_vae/record.json'; make it with: python -m "):
-        assemble(runs=tmp_path / "runs", output=family)
+        assemble(tmp_path / "runs", family)
     assert {path: path.read_bytes() for path in family.rglob("*") if path.is_file()} == before
 
 
@@ -209,7 +209,7 @@ def commands(runs: Path) -> list[str]:
     words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
     lines = done.stdout.replace("\\\n", " ").splitlines()
-    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line]
+    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line or "samples/" in line]
     return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
 
 
@@ -229,5 +229,5 @@ def expected(stage: str, runs: Path) -> list[str]:
 )
 def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
-    last = f"python -m unitouch_gen.training assemble --runs {tmp_path} --output {family}"
+    last = f"python samples/assemble_family.py {tmp_path} {family}"
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]
