@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import writing_folder
 from unitouch_gen.schedule import TRAINED
-from unitouch_gen.training.language_model import PROMPT
 from unitouch_gen.training.stages import STAGES, command_of, weights_of
+from unitouch_gen.training.touch_llm import PROMPT
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.

@@ -47,7 +47,7 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 
 NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
 
-MODULES = {"touch_vae": "image_vae"}
+MODULES = {"touch_vae": "image_vae", "language_model": "touch_llm"}
 """Modules of stages that have none of their own."""
 
 Indices = Callable[[int], Sequence[int]]  # those of a batch by the number of its step

@@ -48,7 +48,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
     "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
-    "touch_llm": ("model.intermediate_size=24",),
+    "touch_llm": ("bridge.intermediate_size=24",),
 }  # fmt: skip
 FROZEN = defaultdict(set, touch_llm={"language_model"})
 """Parts of an objective that are not trained."""
@@ -193,6 +193,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
         ("touch_vae", "--set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
+        ("touch_llm", "--joint {joint} --llama {joint} --set model.hidden_size=16", "`model` is that of `--llama`"),
         ("touch", "--joint {joint} --set data.drawn.sensors=[digit]", "sigma` is 0.75, with no other data set"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
