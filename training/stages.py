@@ -144,18 +144,15 @@ class Stage:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
-    def key(self, splits: list[Rendered]) -> str:
-        """Names the pictures of `splits`, for caches of what is computed from them."""
-        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
-        names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
-        return "-".join([*names, "train", shown])
-
     def computed_once(self, name: str, option: str, splits: list[Rendered], compute: Callable[[], Tensor]) -> Tensor:
         """What a model makes of `splits`: once for the weights that an option named, at each call if none did."""
         weights = self.inputs.get("model", self.inputs.get(option))
         if weights is None:
             return compute()
-        return computed_once(self.cache / f"{name}-{self.key(splits)}-{weights[:16]}.safetensors", compute)
+        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()
+        names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
+        file = "-".join([name, *names, "train", shown[:16], weights[:16]])
+        return computed_once(self.cache / f"{file}.safetensors", compute)
 
     def image_embeddings(self, model: UniTouchModel, splits: list[Rendered]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised."""

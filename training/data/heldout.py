@@ -17,7 +17,7 @@ from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, re
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
-from unitouch_gen.world import SAMPLE_RATE, World
+from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, World
 from unitouch_gen.world.questions import TOPICS, asked_of
 
 FIRST_SEED = 1000  # of the worlds that models are held against: beyond those that recipes train on
@@ -34,7 +34,7 @@ def world_contacts(
     def sounds() -> list[tuple[Tensor, int]]:
         return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
-    labels, classes = {"material": material}, {"material": source.materials}
+    labels, classes = {"material": material}, {"material": MATERIAL_NAMES}
     if grasps:
         margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
         labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
@@ -58,7 +58,7 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     known = {"caption": list(seen.text)} if "text" in modalities else {}
     if "material" in labels and bool((labels["material"] >= 0).all()):
-        known["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
+        known["material"] = [f"it is {data.classes['material'][label]}." for label in labels["material"].tolist()]
     asked = [
         {topic: (TOPICS[topic].questions[0], [answers[row]]) for topic, answers in known.items()}
         for row in range(len(data) if known else 0)
