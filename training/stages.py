@@ -25,7 +25,7 @@ from unitouch_gen.evaluation.contacts import image_embeddings
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
-from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, computed_once
+from unitouch_gen.training.data import Contacts, DataConfig, DrawnContacts, columns_of, computed_once
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 
@@ -140,11 +140,11 @@ class Stage:
         init = self.folders["init"]
         return UNet2DConditionModel.from_pretrained(init, torch_dtype=torch.float32, use_safetensors=True)
 
-    def splits(self, *needs: str) -> list[Rendered]:
+    def splits(self, *needs: str) -> list[Contacts]:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
-    def computed_once(self, name: str, option: str, splits: list[Rendered], compute: Callable[[], Tensor]) -> Tensor:
+    def computed_once(self, name: str, option: str, splits: list[Contacts], compute: Callable[[], Tensor]) -> Tensor:
         """What a model makes of `splits`: once for the weights that an option named, at each call if none did."""
         weights = self.inputs.get("model", self.inputs.get(option))
         if weights is None:
@@ -154,7 +154,7 @@ class Stage:
         file = "-".join([name, *names, "train", shown[:16], weights[:16]])
         return computed_once(self.cache / f"{file}.safetensors", compute)
 
-    def image_embeddings(self, model: UniTouchModel, splits: list[Rendered]) -> Tensor:
+    def image_embeddings(self, model: UniTouchModel, splits: list[Contacts]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised."""
 
         def compute() -> Tensor:
@@ -162,7 +162,7 @@ class Stage:
 
         return self.computed_once("image-embeddings", "joint", splits, compute)
 
-    def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> Indices:
+    def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
         sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
         return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)

@@ -20,7 +20,7 @@ from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM, PreTraine
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import DrawnContacts, Rendered, Source
+from unitouch_gen.training.data import Contacts, DrawnContacts, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.weights import TOUCH_TO_TEXT
@@ -73,13 +73,13 @@ class AnswerObjective(nn.Module):
             return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
 
 
-def pairs_of(sources: Sequence[Source], splits: Sequence[Rendered]) -> list[Pairs]:
+def pairs_of(sources: Sequence[Source], splits: Sequence[Contacts]) -> list[Pairs]:
     """Questions and answers of each sample; of a data set's, its caption again and again."""
     pairs = list[Pairs]()
     for source, split in zip(sources, splits, strict=True):
         if isinstance(source, DrawnContacts):
             draws = World(source.seed).draw(*source.contacts("train"))
-            measured = torch.tensor(split.attributes).mean(dim=1)
+            measured = split.attributes.mean(dim=1)
             asked = [answered(draws, measured, variant) for variant in range(VARIANTS)]
             pairs += [[pair for one in told for pair in one.values()] for told in zip(*asked, strict=True)]
         else:
