@@ -64,7 +64,7 @@ bench: $(VENV)/.installed  ## measure and print every figure that the README and
 	$(BIN)/python -m tests.benchmarks $(ARGS)
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
-	$(BIN)/python -m unitouch_gen.training assemble --runs $(RUNS) --output $(FAMILY)
+	$(BIN)/python samples/assemble_family.py $(RUNS) $(FAMILY)
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.

@@ -132,7 +132,7 @@ def _family(family: str | Path) -> Path:
     if not (family / "joint").is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
-            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
+            "`samples/assemble_family.py` wrote, or leave it out for the built-in one."
         )
     return family
 

@@ -17,7 +17,8 @@ from unitouch_gen.cli.loading import DRAWING
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
 
-NOT_RUN = {"drawing": "draws for the others", "render_inputs": "writes into the checkout", "watch": "needs a camera"}
+NOT_RUN = {"assemble_family": "takes trained stages", "drawing": "draws for the others",
+           "render_inputs": "writes into the checkout", "watch": "needs a camera"}  # fmt: skip
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3])

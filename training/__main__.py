@@ -8,7 +8,6 @@ from typing import Any
 import typer
 
 from unitouch_gen.errors import run_commands
-from unitouch_gen.training.assemble import assemble
 from unitouch_gen.training.stages import Recipe, Stage, run_stage
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
@@ -33,7 +32,6 @@ add("touch_vae", "Learns the autoencoder of touches.")
 add("touch_ldm", "Learns to draw touches from embeddings of pictures.")
 add("language_model", "Learns a small language model of questions about contacts.")
 add("touch_llm", "Learns a bridge from embeddings of pictures into a language model.")
-app.command()(assemble)
 add("distill", "Learns LoRA weights by which a saved pipeline draws in four evaluations.")
 
 if __name__ == "__main__":

@@ -109,8 +109,8 @@ def main(stage: Stage, recipe: ImageTextRecipe) -> None:
     data: dict[str, Any] = {"image": [split.image for split in splits]}
     if objective.attributes:
         chosen = [ATTRIBUTES.index(name) for name in SHOWN]
-        measured = [np.asarray(split.attributes)[:, :, chosen].mean(axis=1) for split in splits]  # by both sensors
-        data["attributes"] = in_deviations(np.concatenate(measured))
+        measured = [split.attributes[:, :, chosen].mean(dim=1) for split in splits]  # by both sensors
+        data["attributes"] = in_deviations(torch.cat(measured).numpy())
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.views:
         pairs = zip(stage.sources, splits, strict=True)

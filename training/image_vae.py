@@ -22,7 +22,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.evaluation.contacts import in_batches
 from unitouch_gen.models.autoencoders import CLASSES, Autoencoder, encode, encode_raw, read_autoencoder, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import Rendered
+from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage
 
@@ -94,7 +94,7 @@ def latents_of(vae: Autoencoder, images: Any) -> Tensor:
 
 
 def cached_latents(
-    stage: Stage, vae: Autoencoder, name: str, splits: list[Rendered], images: Iterable[np.ndarray]
+    stage: Stage, vae: Autoencoder, name: str, splits: list[Contacts], images: Iterable[np.ndarray]
 ) -> Tensor:
     """Latents of all arrays of images, which are columns of the splits, by the autoencoder to build on."""
     file = f"{name}-latents-scale{vae.config.scaling_factor:.6g}"

@@ -25,7 +25,7 @@ from unitouch_gen.evaluation.contacts import image_embeddings
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
-from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, computed_once
+from unitouch_gen.training.data import Contacts, DataConfig, DrawnContacts, columns_of, computed_once
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 
@@ -47,7 +47,7 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 
 NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
 
-MODULES = {"touch_vae": "image_vae"}
+MODULES = {"touch_vae": "image_vae", "language_model": "touch_llm"}
 """Modules of stages that have none of their own."""
 
 Indices = Callable[[int], Sequence[int]]  # those of a batch by the number of its step
@@ -140,24 +140,21 @@ class Stage:
         init = self.folders["init"]
         return UNet2DConditionModel.from_pretrained(init, torch_dtype=torch.float32, use_safetensors=True)
 
-    def splits(self, *needs: str) -> list[Rendered]:
+    def splits(self, *needs: str) -> list[Contacts]:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
-    def key(self, splits: list[Rendered]) -> str:
-        """Names the pictures of `splits`, for caches of what is computed from them."""
-        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
-        names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
-        return "-".join([*names, "train", shown])
-
-    def computed_once(self, name: str, option: str, splits: list[Rendered], compute: Callable[[], Tensor]) -> Tensor:
+    def computed_once(self, name: str, option: str, splits: list[Contacts], compute: Callable[[], Tensor]) -> Tensor:
         """What a model makes of `splits`: once for the weights that an option named, at each call if none did."""
         weights = self.inputs.get("model", self.inputs.get(option))
         if weights is None:
             return compute()
-        return computed_once(self.cache / f"{name}-{self.key(splits)}-{weights[:16]}.safetensors", compute)
+        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()
+        names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
+        file = "-".join([name, *names, "train", shown[:16], weights[:16]])
+        return computed_once(self.cache / f"{file}.safetensors", compute)
 
-    def image_embeddings(self, model: UniTouchModel, splits: list[Rendered]) -> Tensor:
+    def image_embeddings(self, model: UniTouchModel, splits: list[Contacts]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised."""
 
         def compute() -> Tensor:
@@ -165,7 +162,7 @@ class Stage:
 
         return self.computed_once("image-embeddings", "joint", splits, compute)
 
-    def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> Indices:
+    def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
         sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
         return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)

@@ -23,7 +23,7 @@ from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance,
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
-from unitouch_gen.training.data import Rendered, sensor_numbers
+from unitouch_gen.training.data import Contacts, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage
@@ -156,12 +156,12 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
             model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
 
 
-def spread(values: np.ndarray, count: int = 500) -> np.ndarray:
+def spread(values: Any, count: int = 500) -> Any:
     """At most `count` rows, spread over all."""
     return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))]
 
 
-def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool = False) -> None:
+def set_prototypes(model: UniTouchModel, splits: list[Contacts], reaches: bool = False) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training.
 
     With `reaches`, also the distance that nearly all of these are within. Touches beyond it get no tokens, so the
@@ -169,7 +169,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered], reaches: bool =
     """
     model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
-        parts = [split.touch for split in splits if split.sensor == name]
+        parts = [split.touch for split in splits if split.sensors[0] == name]
         mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / sum(map(len, parts)) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
@@ -195,7 +195,7 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
 
 
 @torch.no_grad()
-def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
+def fit_distance(model: UniTouchModel, splits: Sequence[Contacts]) -> None:
     """Gives a model the distance of touches, by class where materials are known, and its threshold."""
     stem, weight = model.touch_model.stem, model.touch_model.projection.weight
 
@@ -205,22 +205,24 @@ def fit_distance(model: UniTouchModel, splits: Sequence[Rendered]) -> None:
         return torch.cat([touch_statistics(stem(part.to(weight)), part) for part in parts]).cpu()
 
     cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
-    pressed = [spread(np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover]) for one in splits]
-    rows = torch.from_numpy(np.concatenate(pressed)) > 0.0
-    materials = torch.from_numpy(np.concatenate([spread(split.material) for split in splits]))[rows]
+    pressed = [torch.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover] for one in splits]
+    rows = torch.cat([*map(spread, pressed)]) > 0.0
+    # Data sets number materials in their own ways, so all of theirs are one class.
+    known = [one.material if one.attributes is not None else torch.full((len(one),), -1) for one in splits]
+    materials = torch.cat([*map(spread, known)])[rows]
     touches, pictures = statistics(split.touch for split in splits)[rows], statistics(split.image for split in splits)
     distance = RelativeDistance(fit_gaussians(touches, materials), fit_gaussians(pictures, torch.zeros(len(pictures))))
     model.out_of_distribution["touch"] = distance
     model.config.ood_thresholds = {"touch": {"foreign": distance(touches).quantile(1.0 - ABSTAINED).item()}}
 
 
-def pairs_of(splits: list[Rendered]) -> dict[str, Any]:
+def pairs_of(splits: list[Contacts]) -> dict[str, Any]:
     """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation."""
-    attributes, maps = (np.concatenate([getattr(split, name) for split in splits]) for name in ("attributes", "maps"))
+    attributes = torch.cat([split.attributes for split in splits]).numpy()
     return {
         "second": [split.second for split in splits],
         "attributes": in_deviations(attributes, (0, 1)),
-        "maps": in_deviations(maps, (0, 1, 3, 4)).astype(np.float16),
+        "maps": in_deviations(np.concatenate([split.maps for split in splits]), (0, 1, 3, 4)).astype(np.float16),
     }
 
 
@@ -230,8 +232,8 @@ def main(stage: Stage, recipe: TouchRecipe) -> None:
     model = stage.joint_space("image")
     splits = stage.splits("image", "touch", "sensor")
     embeds = stage.image_embeddings(model, splits)
-    tokens, named = recipe.sensors.tokens, dict.fromkeys(split.sensor for split in splits if split.sensor is not None)
-    model.config.sensors = [] if tokens == 0 else [*named]
+    tokens, names = recipe.sensors.tokens, dict.fromkeys(name for split in splits for name in split.sensors)
+    model.config.sensors = [] if tokens == 0 else [name for name in names if name is not None]
     model.config.sensor_tokens = tokens or model.config.sensor_tokens
     model.add("touch")
     if "init" in stage.folders:

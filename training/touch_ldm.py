@@ -26,7 +26,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import Rendered, sensor_numbers
+from unitouch_gen.training.data import Contacts, sensor_numbers
 from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents
@@ -91,7 +91,7 @@ class TouchDiffusionObjective(nn.Module):
         return conditions
 
 
-def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
+def places_of(splits: Sequence[Contacts]) -> list[np.ndarray]:
     """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
     starts = np.cumsum([0, *(2 * -(-len(split) // GROUP) for split in splits)])
     return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]

@@ -23,7 +23,7 @@ from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import RELIEF_CHANNELS
 from unitouch_gen.training import batches
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of
+from unitouch_gen.training.data import Contacts, DataConfig, columns_of
 from unitouch_gen.training.image_text import SHOWN
 from unitouch_gen.training.recipe import read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
@@ -49,9 +49,10 @@ class ClassifierObjective(nn.Module):
         return {"loss": F.cross_entropy(seen.logits, batch["material"], label_smoothing=0.05) + error}
 
 
-def columns(splits: Sequence[Rendered], kind: str) -> tuple[list[Any], np.ndarray, np.ndarray]:
+def columns(splits: Sequence[Contacts], kind: str) -> tuple[list[Any], np.ndarray, np.ndarray]:
     """Images, their materials (N,) and attributes (N, K): of touches by either sensor, of pictures the mean of both."""
-    material, measured = np.concatenate([split.material for split in splits]), [one.attributes for one in splits]
+    material = np.concatenate([split.material.numpy() for split in splits])
+    measured = [split.attributes.numpy() for split in splits]
     if kind == "touch":
         pixels = [split.touch for split in splits] + [split.second for split in splits]
         return pixels, np.tile(material, 2), np.concatenate([one[:, by] for by in (0, 1) for one in measured])

@@ -10,7 +10,7 @@ from diffusers import AutoencoderTiny
 
 from tests.helpers.components import AUDIO, clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of
+from unitouch_gen.training.data import Contacts, DataConfig, columns_of
 
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
@@ -56,7 +56,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
+def split(cache: Path, _processor: UniTouchProcessor) -> Contacts:
     """136 contacts, eight of each material."""
     data = DataConfig(drawn=DRAWN)
     return columns_of(data.sources(), cache, data, _processor, ())[0]

@@ -20,7 +20,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, sensor_numbers
+from unitouch_gen.training.data import Contacts, DataConfig, columns_of, sensor_numbers
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
 from unitouch_gen.world import untouched_gel
@@ -67,9 +67,10 @@ def test_touches_are_pulled_to_their_pictures_and_tokens_learn_from_their_own_se
     assert gradient[1].abs().max() > 0 and gradient[0].abs().max() == 0
 
 
-def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Rendered) -> None:
+def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Contacts) -> None:
     rng = np.random.default_rng(0)
-    others = [replace(split, sensor="gelsight", touch=rng.integers(0, 256, (n, 3, 32, 32), np.uint8)) for n in (3, 8)]
+    named = replace(split, sensors=["gelsight"] * len(split))
+    others = [replace(named, touch=rng.integers(0, 256, (n, 3, 32, 32), np.uint8)) for n in (3, 8)]
     touch.set_prototypes(model, [others[0], split, others[1]])
     both = np.concatenate([other.touch for other in others])
     for name, touches in (("gelsight", both), ("digit", split.touch)):
@@ -93,7 +94,7 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
 
 
 def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_encoder(model, processor, split, tmp_path):
-    splits = [split, replace(split, sensor="gelsight", touch=split.second)]
+    splits = [split, replace(split, sensors=["gelsight"] * len(split), touch=split.second)]
     touch.set_prototypes(model, splits, reaches=True)
     touch.fit_distance(model, splits)
     model.save_pretrained(tmp_path / "touch")

@@ -14,12 +14,12 @@ from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from assemble_family import assemble
 from tests.helpers.components import AUDIO, SPACE
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.__main__ import app
-from unitouch_gen.training.assemble import assemble
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import STAGES, Stage, command_of, weights_of
 from unitouch_gen.training.touch import TouchRecipe
@@ -48,7 +48,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
     "touch_ldm": UNET,
     "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
-    "touch_llm": ("model.intermediate_size=24",),
+    "touch_llm": ("bridge.intermediate_size=24",),
 }  # fmt: skip
 FROZEN = defaultdict(set, touch_llm={"language_model"})
 """Parts of an objective that are not trained."""
@@ -117,7 +117,7 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
 
 @pytest.fixture(scope="module")
 def family(runs: Path) -> Path:
-    assemble(runs=runs, output=runs / "family")
+    assemble(runs, runs / "family")
     return runs / "family"
 
 
@@ -158,10 +158,10 @@ def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_oth
     vae = tmp_path / "runs" / "image_vae"
     save_file({"weight": torch.ones(2)}, next((vae / "model").glob("*.safetensors")))
     with pytest.raises(InvalidInputError, match="unclip', which was built on other weights than image_vae holds now"):
-        assemble(runs=tmp_path / "runs", output=family)
+        assemble(tmp_path / "runs", family)
     (vae / "record.json").unlink()
     with pytest.raises(InvalidInputError, match=r"lacks .*image_vae/record.json'; make it with: python -m "):
-        assemble(runs=tmp_path / "runs", output=family)
+        assemble(tmp_path / "runs", family)
     assert {path: path.read_bytes() for path in family.rglob("*") if path.is_file()} == before
 
 
@@ -193,6 +193,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
         ("touch_vae", "--set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
+        ("touch_llm", "--joint {joint} --llama {joint} --set model.hidden_size=16", "`model` is that of `--llama`"),
         ("touch", "--joint {joint} --set data.drawn.sensors=[digit]", "sigma` is 0.75, with no other data set"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "The network has"),
@@ -209,7 +210,7 @@ def commands(runs: Path) -> list[str]:
     words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
     lines = done.stdout.replace("\\\n", " ").splitlines()
-    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line]
+    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line or "samples/" in line]
     return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
 
 
@@ -229,5 +230,5 @@ def expected(stage: str, runs: Path) -> list[str]:
 )
 def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
-    last = f"python -m unitouch_gen.training assemble --runs {tmp_path} --output {family}"
+    last = f"python samples/assemble_family.py {tmp_path} {family}"
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]

@@ -3,14 +3,14 @@
 import torch
 
 from tests.helpers.components import make_language_parts
-from unitouch_gen.training import language_model
+from unitouch_gen.training import touch_llm
 from unitouch_gen.world import ATTRIBUTES, MATERIALS, World
 from unitouch_gen.world.questions import TOPICS, answered
 
 
 def test_labels_are_the_answers_and_their_end(processor) -> None:
     tokenizer = make_language_parts()["tokenizer"]
-    pairs = language_model.encoded(tokenizer, [[("How is it?", "rough."), ("ä?", "é")]])
+    pairs = touch_llm.encoded(tokenizer, [[("How is it?", "rough."), ("ä?", "é")]])
     for row, (prompt, answer) in enumerate((("How is it?\n", "rough."), ("ä?\n", "é"))):
         ids, labels = pairs["input_ids"][0, row], pairs["labels"][0, row]
         assert tokenizer.decode(labels[labels >= 0].tolist()) == answer + "</s>"

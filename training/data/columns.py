@@ -5,17 +5,18 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
@@ -23,7 +24,7 @@ from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, 
 from unitouch_gen.training.data.records import Record, few
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
-from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, SAMPLE_RATE
+from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, MATERIAL_NAMES, SAMPLE_RATE
 
 Source = DrawnContacts | RecordSet
 
@@ -58,37 +59,17 @@ class DataConfig(Settings):
         return sources
 
 
-@dataclass
-class Rendered:
-    """One split of drawn contacts, or of one sensor of a data set, as memory-mapped arrays."""
-
-    image: np.ndarray  # uint8 (N, 3, S, S)
-    touch: np.ndarray  # uint8 (N, 3, T, T)
-    audio: np.ndarray  # log-mel clips, float16 (N, 1, mel_bins, frames)
-    material: np.ndarray  # int64 (N,); -1 of data sets
-    text: list[str]
-    sensor: str | None  # its only one; None where each contact has drawn ones
-    fingerprint: str  # what changes with any of it
-    background: np.ndarray | None = None  # the gel before the contact, as `touch`; of data sets
-    second: np.ndarray | None = None  # touches by the second sensor of each drawn contact
-    attributes: np.ndarray | None = None  # what is measured of it by either sensor, `ATTRIBUTES`, float32 (N, 2, 13)
-    maps: np.ndarray | None = None  # the same in each part of the view, `MAPS`, float16 (N, 2, 4, 8, 8)
-
-    def __len__(self) -> int:
-        return len(self.material)
-
-
-FIELDS = {"image": "picture", "audio": "sound", "text": "caption"}  # of a record, where columns have other names
+FIELDS = {"image": "picture", "gel": "background", "audio": "sound", "text": "caption"}  # in a record
 
 
 def has(record: Record, need: str) -> bool:
-    """Whether a record has a column that a stage may need: touch, image, background, audio, text, sensor."""
+    """Whether a record has a column that a stage may need: touch, image, gel, audio, text, sensor."""
     return getattr(record, FIELDS.get(need, need)) is not None
 
 
 def columns_of(
     sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str],
-) -> list[Rendered]:  # fmt: skip
+) -> list[Contacts]:  # fmt: skip
     """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
     `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
@@ -109,9 +90,9 @@ def columns_of(
     ]
 
 
-def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Rendered:
+def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Contacts:
     """Renders a split of the world if the cache does not hold it yet, and opens it."""
-    material, size, mel = source.contacts(split)[0].numpy(), processor.image_size, processor.audio
+    (material, number, _), size, mel = source.contacts(split), processor.image_size, processor.audio
     fingerprint = f"{source.fingerprint(split)}-{size}-{hashlib.sha256(str(mel).encode()).hexdigest()[:8]}"
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
     columns: dict[str, tuple[Any, ...]] = {
@@ -134,11 +115,15 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
         (place / "text.json").write_text(json.dumps(text))
 
     arrays: Any = mapped(folder, len(material), columns, write)
-    text = json.loads((folder / "text.json").read_text())
-    return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
+    arrays["attributes"] = torch.from_numpy(np.array(arrays["attributes"]))
+    return Contacts(
+        **arrays, sensors=[source.sensor] * len(material), objects=10**6 * material + number,
+        labels={"material": material}, classes={"material": MATERIAL_NAMES},
+        text=json.loads((folder / "text.json").read_text()), fingerprint=fingerprint,
+    )  # fmt: skip
 
 
-def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.ndarray:
+def relit(cache: Path, source: DrawnContacts, split: str, seen: Contacts) -> np.ndarray:
     """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), once into the cache."""
 
     def write(arrays: Arrays, _: Path) -> None:
@@ -152,7 +137,7 @@ def relit(cache: Path, source: DrawnContacts, split: str, seen: Rendered) -> np.
 
 def decoded(
     cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], touch_size: int | None = None
-) -> Rendered:
+) -> Contacts:
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
     Files that cannot be read are refused in a list, and leave nothing in the cache.
@@ -161,7 +146,7 @@ def decoded(
     side = touch_size or size
     kinds: dict[str, tuple[Any, ...]] = {
         "image": (np.uint8, 3, size, size),
-        **dict.fromkeys(("touch", "background"), (np.uint8, 3, side, side)),
+        **dict.fromkeys(("touch", "gel"), (np.uint8, 3, side, side)),
         "audio": (np.float16, 1, mel.mel_bins, mel.frames),
     }
 
@@ -189,13 +174,13 @@ def decoded(
         if name in needs:
             folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
             columns[name] = mapped(folder, len(data), {"values": kind}, partial(decode, name))["values"]
-    return Rendered(
-        **columns,
-        material=np.full(len(data), -1),
-        text=[record.caption or "" for record in data.records],
-        sensor=data.sensor or "",
-        fingerprint=fingerprint,
-    )
+    labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
+    objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
+    return Contacts(
+        **columns, sensors=[record.sensor for record in data.records], objects=torch.from_numpy(objects),
+        labels=labels, classes=data.classes, fingerprint=fingerprint,
+        text=[record.caption or "" for record in data.records] if "text" in needs else (),
+    )  # fmt: skip
 
 
 def as_bytes(pixels: Tensor) -> np.ndarray:
@@ -209,7 +194,7 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
 
 
-def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str], unnamed: int = -1) -> np.ndarray:
+def sensor_numbers(splits: Sequence[Contacts], names: Sequence[str], unnamed: int = -1) -> np.ndarray:
     """The place of each sample's sensor in `names`, int64 (N,); `unnamed` where it has none."""
-    numbers = [names.index(split.sensor) if split.sensor in names else unnamed for split in splits]
-    return np.repeat(numbers, [len(split) for split in splits])
+    numbers: dict[str | None, int] = {name: number for number, name in enumerate(names)}
+    return np.array([numbers.get(sensor, unnamed) for split in splits for sensor in split.sensors])

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
@@ -44,8 +44,6 @@ class DrawnContacts:
     seed: int = 0
     held_out: int = 16  # objects of the other splits
 
-    materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
-
     @property
     def name(self) -> str:
         return f"drawn-{self.sensor or 'any'}"
@@ -55,7 +53,7 @@ class DrawnContacts:
         first = 1000 * self.number + FIRST_OBJECT[split]
         count = self.objects if split == "train" else self.held_out
         contacts = {"train": self.contacts_per_object, "val": 2, "test": 5, "beyond": 5}[split]
-        ranges = (range(len(self.materials)), range(first, first + count), range(contacts))
+        ranges = (range(len(MATERIAL_NAMES)), range(first, first + count), range(contacts))
         grid = torch.cartesian_prod(*map(torch.tensor, ranges))
         order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
         return grid[order, 0], grid[order, 1], grid[order, 2]

@@ -5,7 +5,6 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,46 +28,36 @@ def world_contacts(
 ) -> Contacts:
     """Contacts of a split of the world, rendered once into `cache`; with the label "grasp", if asked for."""
     seen, size = drawn(cache, source, split, processor), processor.image_size
-    material, number, _ = source.contacts(split)
 
     def sounds() -> list[tuple[Tensor, int]]:
         return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
-    labels, classes = {"material": material}, {"material": source.materials}
+    labels, classes = {**seen.labels}, {**seen.classes}
     if grasps:
         margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
         labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
-    attributes = torch.from_numpy(np.array(seen.attributes))
-    return Contacts(
-        seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
-        image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds,
+    return replace(
+        seen, labels=labels, classes=classes, sounds=sounds,
         relit=lambda: float_pixels(relit(cache, source, split, seen)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
-        attributes=attributes,
-        asked=lambda: asked_of(World(source.seed).draw(*source.contacts(split)), attributes[:, 0]),
+        asked=lambda: asked_of(World(source.seed).draw(*source.contacts(split)), seen.attributes[:, 0]),
     )  # fmt: skip
 
 
 def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet) -> Contacts:
     """Contacts of a data set, with what every one of its records has, decoded once into `cache`."""
     modalities = modalities_of(data)
-    gel = ["background"] if all(has(record, "background") for record in data.records) else []
+    gel = ["gel"] if all(has(record, "gel") for record in data.records) else []
     seen = decoded(cache, data, processor, ["touch", *gel, *modalities])
-    labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
-    objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     known = {"caption": list(seen.text)} if "text" in modalities else {}
-    if "material" in labels and bool((labels["material"] >= 0).all()):
-        known["material"] = [f"it is {data.materials[label]}." for label in labels["material"].tolist()]
+    if bool((seen.material >= 0).all()):
+        known["material"] = [f"it is {data.classes['material'][label]}." for label in seen.material.tolist()]
     asked = [
         {topic: (TOPICS[topic].questions[0], [answers[row]]) for topic, answers in known.items()}
         for row in range(len(data) if known else 0)
     ]
-    return Contacts(
-        seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
-        image=seen.image, audio=seen.audio, text=seen.text if "text" in modalities else (), gel=seen.background,
-        sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None,
-        asked=lambda: asked,
-    )  # fmt: skip
+    sounds = (lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None
+    return replace(seen, sounds=sounds, asked=lambda: asked)
 
 
 def modalities_of(data: RecordSet) -> list[str]:

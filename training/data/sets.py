@@ -60,11 +60,6 @@ class RecordSet:
         return len(self.records)
 
     @property
-    def materials(self) -> tuple[str, ...]:
-        """Names of the materials; none where it has no such label."""
-        return self.classes.get("material", ())
-
-    @property
     def sensor(self) -> str | None:
         """The sensor of its first record: that of all in a part of `by_sensor`."""
         return self.records[0].sensor

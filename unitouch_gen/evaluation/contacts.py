@@ -1,4 +1,4 @@
-"""Held-out contacts: what was seen, heard and said of each, what it is, and what encoders and controls make of it."""
+"""Contacts: what was seen, heard and said of each, what it is, and what encoders and controls make of it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,10 +31,12 @@ class Contacts:
         audio, text: Log-mel clips (N, 1, mel_bins, frames), and captions.
         gel: What each sensor sees untouched.
         attributes: `unitouch_gen.world.ATTRIBUTES` by either sensor, float32 (N, 2, K).
+        maps: `unitouch_gen.world.MAPS` in each part of the view, float16 (N, 2, 4, 8, 8).
         sounds: Gives the sounds, as pipelines take them.
         relit: Gives the pictures under another lamp, float32 in [0, 1].
         asked: Gives, by topic, a question about each contact, and answers that are true.
         features: (N, D) by name; see `embed`.
+        fingerprint: Changes with any of what was rendered or decoded.
     """
 
     touch: Any  # such arrays are mapped into memory, or computed row by row
@@ -47,11 +49,16 @@ class Contacts:
     text: Sequence[str] = ()
     gel: Any = None
     second: Any = None
-    attributes: Tensor | None = None
+    attributes: Any = None
+    maps: Any = None
     sounds: Callable[[], Any] | None = None
     relit: Callable[[], Tensor] | None = None
     asked: Callable[[], Sequence[Mapping[str, tuple[str, Sequence[str]]]]] = tuple
     features: dict[str, Tensor] = field(default_factory=dict)
+    fingerprint: str = ""
+
+    def __len__(self) -> int:
+        return len(self.objects)
 
     @property
     def material(self) -> Tensor:

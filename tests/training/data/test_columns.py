@@ -13,7 +13,7 @@ from tests.helpers.data_sets import RED, write_image
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.__main__ import app
-from unitouch_gen.training.data import DataConfig, Rendered, columns_of, computed_once, open_dataset
+from unitouch_gen.training.data import Contacts, DataConfig, columns_of, computed_once, open_dataset
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
-def columns(folder: Path, cache: Path, processor: UniTouchProcessor, *needs: str, **changes: object) -> list[Rendered]:
+def columns(folder: Path, cache: Path, processor: UniTouchProcessor, *needs: str, **changes: object) -> list[Contacts]:
     config = DataConfig(sets=[{"path": str(folder), "split": "none"}], **changes)
     return columns_of(config.sources(), cache, config, processor, needs)
 
@@ -49,7 +49,7 @@ def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp
         assert isinstance(other.touch, np.memmap) and one.fingerprint == other.fingerprint
         for name in ("image", "touch", "audio"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert [(split.sensor, len(split)) for split in cached] == [("digit", 15), ("gelsight", 5)]
+    assert [({*split.sensors}, len(split)) for split in cached] == [({"digit"}, 15), ({"gelsight"}, 5)]
     smaller, split = UniTouchProcessor(image_size=24), cached[1]
     for row, number in enumerate(range(15, 20)):
         image = processor.raw_images(str(folder / f"picture{number}.png"))[0].numpy()
@@ -127,6 +127,7 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
     ]
     model = UniTouchModel.from_pretrained(tmp_path / "touch" / "model", modalities=("touch",))
     assert model.sensor_bank.names == ("digit", "gelsight")
+    assert len(model.out_of_distribution["touch"].groups["known"].means) == 1  # whatever materials it names
     kept = [record.touch.path for record in open_dataset(folder).split("train").by_sensor()[1].records]
     mean = torch.stack([UniTouchProcessor(32).raw_images(file)[0] for file in kept]).mean(dim=0)
     torch.testing.assert_close(model.sensor_bank.prototype("gelsight"), mean, atol=1 / 255, rtol=0)

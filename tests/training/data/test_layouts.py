@@ -208,7 +208,7 @@ def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
     object_folder(tmp_path)
     names = ["wood", "steel", "polycarbonate", "plastic", "iron", "ceramic", "glass"]
     data = open_dataset(tmp_path, sensor="mine", materials=names)
-    assert data.materials == tuple(names) and {record.sensor for record in data.records} == {"mine"}
+    assert data.classes["material"] == tuple(names) and {record.sensor for record in data.records} == {"mine"}
     (tmp_path / "split.json").unlink()
     assert len(open_dataset(tmp_path)) == 4  # without a split all points are there
 

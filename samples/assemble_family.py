@@ -1,10 +1,11 @@
-"""The last stage: puts the outputs of the others together into one family of weights, in fp16.
+"""Puts the outputs of all stages of training together into one family of weights, in fp16, as `tiny(family=)` takes it.
 
-python -m unitouch_gen.training assemble --runs runs --output my-family
+python samples/assemble_family.py runs my-family
 """
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,11 +13,11 @@ import typer
 from diffusers import DDPMScheduler, DEISMultistepScheduler, EulerAncestralDiscreteScheduler
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import writing_folder
 from unitouch_gen.schedule import TRAINED
-from unitouch_gen.training.language_model import PROMPT
 from unitouch_gen.training.stages import STAGES, command_of, weights_of
+from unitouch_gen.training.touch_llm import PROMPT
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
@@ -68,9 +69,8 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
 
 
 def assemble(
-    *,
-    runs: Annotated[Path, typer.Option(help="Folder of the stages' outputs.")] = Path("runs"),
-    output: Annotated[Path, typer.Option(help="Folder of the family; what else it holds stays.")],
+    runs: Annotated[Path, typer.Argument(help="Folder of the stages' outputs.")],
+    output: Annotated[Path, typer.Argument(help="Folder of the family; what else it holds stays.")],
 ) -> None:
     """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
 
@@ -98,3 +98,9 @@ def assemble(
             scheduler.save_pretrained(place / name / "scheduler")
         halve(place)
         write_json({"training": records, "figures": {}}, place / "family.json")
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(assemble)
+    sys.exit(run_commands(app, "assemble_family"))
