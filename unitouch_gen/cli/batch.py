@@ -10,7 +10,7 @@ from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
+from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
 from unitouch_gen.files import check_file, files_below, read_table
@@ -44,9 +44,9 @@ def batch(
     from accelerate.utils import gather_object
     from tqdm import tqdm
 
-    from unitouch_gen import pipelines
+    from unitouch_gen.pipelines.tiny import PIPELINES
 
-    kind = getattr(pipelines, CLASSES[pipeline])
+    kind = PIPELINES[pipeline]
     shared, known = options.call_arguments(context, kind), inspect.signature(kind.__call__).parameters
     columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
     folder = source if source.is_dir() else source.parent
