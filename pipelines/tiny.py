@@ -28,9 +28,6 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "x-to-touch": XToTouchPipeline,
     "touch-to-text": TouchToTextPipeline,
 }
-FOLDERS = {"stylization": "touch-to-image"}
-"""Folder of a pipeline's networks, where it is not named after the pipeline."""
-
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
 """Distilled pipelines, and those that they were distilled from, whose folders hold the LoRA weights in `turbo`."""
 
@@ -54,7 +51,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     """
     teacher = TURBO.get(check_choice("name", name, [*PIPELINES, *TURBO]), name)
     kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
-    folder = family / FOLDERS.get(teacher, teacher)
+    folder = family / ("touch-to-image" if teacher == "stylization" else teacher)  # which share their networks
     if name in TURBO:
         needed("peft")
         if not (folder / "turbo").is_dir():
