@@ -227,13 +227,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
-        # 3. Denoise
-        with report.stage("denoising"):
-            latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
-
-        # 4. Decode the finite samples
-        with report.stage("decoding"):
-            images = self._images(settings, latents, report)
+        # 3. Denoise, and decode the finite samples
+        latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
+        images = self._images(settings, latents, report)
         self.maybe_free_model_hooks()
         return images
 
