@@ -1,16 +1,10 @@
 """Pictures are prepared with Pillow here, so that transformers need not tell everyone that torchvision is missing.
 
-It does so when its image processor of CLIP is first looked for, which diffusers' pipelines do when they are imported.
+It does so when diffusers' pipelines are imported, which look for its image processor of CLIP.
 """
 
 import logging
 
-import transformers
-
-_logger = logging.getLogger("transformers.utils.import_utils")
-_level = _logger.level
-_logger.setLevel(logging.ERROR)
-try:
-    getattr(transformers, "CLIPImageProcessor", None)
-finally:
-    _logger.setLevel(_level)
+logging.getLogger("transformers.utils.import_utils").addFilter(
+    lambda record: "`CLIPImageProcessor` requires torchvision" not in record.getMessage()
+)

@@ -335,7 +335,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             run.guidance, run.interrupted = Guidance(scale), caller._interrupt
             return changed.get("latents", latents)
 
-        with self.progress_bar(total=total) as bar:
+        with report.stage("denoising"), self.progress_bar(total=total) as bar:
             result = sample(
                 network if wrap is None else wrap(network),
                 noise.to(device),
@@ -368,15 +368,16 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             report.left_out.append("VAE decoder")
             return latents[rows]
         pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
-        if rows:
-            pixels = decode(self.vae, latents[rows])
-            finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
-            for row in torch.tensor(rows)[~finite.cpu()].tolist():
-                if settings.throw:
-                    raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
-                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
-            pixels = pixels[finite]
-        return self.image_processor.postprocess(pixels, output_type=settings.output_type)
+        with report.stage("decoding"):
+            if rows:
+                pixels = decode(self.vae, latents[rows])
+                finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
+                for row in torch.tensor(rows)[~finite.cpu()].tolist():
+                    if settings.throw:
+                        raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
+                    report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+                pixels = pixels[finite]
+            return self.image_processor.postprocess(pixels, output_type=settings.output_type)
 
     # Reading and saving -----------------------------------------------------------------------------------------------
 

@@ -1,12 +1,10 @@
 """Reads published weights: a converted joint space and an unCLIP pipeline."""
 
-import math
 import os
 from typing import Any
 
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
-from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import check_dtype
@@ -45,9 +43,3 @@ def read_unclip(
             model.vision_model = encoder
             model.config.vision_config = encoder.config
     return pipe
-
-
-def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:
-    """RMS norm of embeddings with mean m and standard deviation s: sqrt(sum of m^2 + s^2)."""
-    mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
-    return math.sqrt(float((mean.square() + std.square()).sum()))

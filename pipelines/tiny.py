@@ -28,9 +28,6 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "x-to-touch": XToTouchPipeline,
     "touch-to-text": TouchToTextPipeline,
 }
-FOLDERS = {"stylization": "touch-to-image"}
-"""Folder of a pipeline's networks, where it is not named after the pipeline."""
-
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
 """Distilled pipelines, and those that they were distilled from, whose folders hold the LoRA weights in `turbo`."""
 
@@ -54,14 +51,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     """
     teacher = TURBO.get(check_choice("name", name, [*PIPELINES, *TURBO]), name)
     kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
-    folder = family / FOLDERS.get(teacher, teacher)
-    if name in TURBO:
-        needed("peft")
-        if not (folder / "turbo").is_dir():
-            raise InvalidInputError(
-                f"`family` is {str(family)!r}, which has no folder {folder.name}/turbo for {name!r}; make its "
-                f"weights by `unitouch-gen distill`, or take {teacher!r}."
-            )
+    folder = family / ("touch-to-image" if teacher == "stylization" else teacher)  # which share their networks
 
     def stored(part: Any, place: Path) -> Any:
         made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
@@ -107,6 +97,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 def distilled(pipe: Any, folder: Path) -> Any:
     """A copy of a pipeline with LoRA weights of `unitouch-gen distill` fused into its UNet, and their defaults."""
     needed("peft")
+    if not folder.is_dir():
+        raise InvalidInputError(f"{str(folder)!r} is no folder of LoRA weights; make them by `unitouch-gen distill`.")
     made, unet = copy.copy(pipe), copy.deepcopy(pipe.unet)
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
     unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)

@@ -44,7 +44,7 @@ from unitouch_gen.pipelines.base import (
     runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip
+from unitouch_gen.pipelines.published import read_joint, read_unclip
 from unitouch_gen.sampling import Guidance, Network, RunReport
 
 
@@ -227,13 +227,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
-        # 3. Denoise
-        with report.stage("denoising"):
-            latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
-
-        # 4. Decode the finite samples
-        with report.stage("decoding"):
-            images = self._images(settings, latents, report)
+        # 3. Denoise, and decode the finite samples
+        latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
+        images = self._images(settings, latents, report)
         self.maybe_free_model_hooks()
         return images
 
@@ -391,5 +387,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         source = read_unclip(unclip, model, dtype, variant, revision=revision, **hub)
         if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
             processor.tokenizer = source.tokenizer
-        model.config.embedding_norm = expected_norm(source.image_normalizer)
+        mean, std = source.image_normalizer.mean.double(), source.image_normalizer.std.double()
+        model.config.embedding_norm = (mean.square() + std.square()).sum().sqrt().item()  # RMS norm of embeddings
         return cls.from_pipe(source, unitouch=model, processor=processor)

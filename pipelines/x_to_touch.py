@@ -216,13 +216,9 @@ class XToTouchPipeline(UniTouchPipeline):
             hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])
             labels = None if labels is None else torch.cat([labels, labels])
 
-        # 3. Denoise
-        with report.stage("denoising"):
-            result = self._denoise(settings, hidden_states, labels, report, extra_channels=extra_channels)
-
-        # 4. Decode the finite samples
-        with report.stage("decoding"):
-            images = self._images(settings, result, report)
+        # 3. Denoise, and decode the finite samples
+        result = self._denoise(settings, hidden_states, labels, report, extra_channels=extra_channels)
+        images = self._images(settings, result, report)
         self.maybe_free_model_hooks()
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, kind_of, load_pipeline
+from unitouch_gen.cli.loading import kind_of, load_pipeline
 from unitouch_gen.errors import InvalidInputError, needed
 
 
@@ -29,9 +29,11 @@ def app(
         socket.create_server((host, port)).close()
     except (OSError, UnicodeError) as error:
         raise InvalidInputError(f"`--port` {port} cannot be served at {host!r}: {error}; name another.") from error
-    models = {kind_of(one, [*CLASSES]): one for one in model} if model else dict.fromkeys(CLASSES)
     with tempfile.TemporaryDirectory(prefix="unitouch-") as folder:
         os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
+        from unitouch_gen.pipelines.tiny import PIPELINES  # after that, as its libraries read it
+
+        models = {kind_of(one, PIPELINES): one for one in model} if model else dict.fromkeys(PIPELINES)
         needed("gradio", "app")
         from unitouch_gen.cli.page import launch
 

@@ -10,7 +10,7 @@ from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, DRAWING, files_in, load_pipeline, suffixes_of
+from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
 from unitouch_gen.files import check_file, files_below, read_table
@@ -44,14 +44,14 @@ def batch(
     from accelerate.utils import gather_object
     from tqdm import tqdm
 
-    from unitouch_gen import pipelines
+    from unitouch_gen.pipelines.tiny import PIPELINES
 
-    kind = getattr(pipelines, CLASSES[pipeline])
+    kind = PIPELINES[pipeline]
     shared, known = options.call_arguments(context, kind), inspect.signature(kind.__call__).parameters
     columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
     folder = source if source.is_dir() else source.parent
     rows = [{"seed": str(seed), **{column: cell for column, cell in row.items() if cell}} for row in rows]
-    pictures = pictures_of(rows, columns, folder, output, shared)
+    pictures = pictures_of(rows, columns, folder, output)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
     if manifest.exists() and not (lines := manifest.read_bytes()).endswith(b"\n"):  # of a disk that was full
@@ -67,7 +67,7 @@ def batch(
     output.mkdir(parents=True, exist_ok=True)
     with state.split_between_processes(calls) as mine:
         for call in tqdm(mine, unit="call", disable=None if state.is_main_process else True):
-            made = make(pipe, call)
+            made = make(pipe, call, shared)
             with manifest.open("a", encoding="utf-8") as stream:
                 stream.write("".join(f"{json.dumps(line)}\n" for _, line in made))
             for (image, line), picture in zip(made, call, strict=True):
@@ -93,9 +93,7 @@ def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]
     return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
 
 
-def pictures_of(
-    rows: Sequence[dict[str, str]], columns: Sequence[str], folder: Path, output: Path, settings: dict[str, Any]
-) -> list[Picture]:
+def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: Path, output: Path) -> list[Picture]:
     """What is made of each row, and where it goes: by its name, or that of what it is made of.
 
     Names of files in the rows start from a folder.
@@ -112,7 +110,7 @@ def pictures_of(
         own = {column: row[column] for column in COLUMNS if column in row}
         inputs = {column: str(folder.absolute() / cell) if column in FILES else cell for column, cell in own.items()}
         seed = check_integer("seed", options.value_of(row["seed"]), 0, 2**32)
-        pictures.append(Picture(inputs, output / f"{name}.png", seed, settings))
+        pictures.append(Picture(inputs, output / f"{name}.png", seed))
     return pictures
 
 
@@ -124,13 +122,13 @@ def calls_of(pictures: Sequence[Picture], most: int) -> list[list[Picture]]:
     return [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
 
 
-def make(pipe: Any, call: list[Picture]) -> list[tuple[Any, dict[str, Any]]]:
+def make(pipe: Any, call: list[Picture], settings: dict[str, Any]) -> list[tuple[Any, dict[str, Any]]]:
     """A call's PIL images, `None` for those that fail, and lines of the manifest; if it fails, each is tried alone."""
     try:
-        output = draw(pipe, call)
+        output = draw(pipe, call, settings)
     except (InvalidInputError, errors.InvalidTypeError, errors.NonFiniteError, errors.NotConvergedError) as error:
         if len(call) > 1:
-            return [made for one in call for made in make(pipe, [one])]
+            return [made for one in call for made in make(pipe, [one], settings)]
         return [(None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
-    lines = [{**described(one, output.report, row), "seed": one.seed, **one.settings} for row, one in enumerate(call)]
+    lines = [{**described(one, output.report, row), "seed": one.seed, **settings} for row, one in enumerate(call)]
     return list(zip(output.images, lines, strict=True))

@@ -9,7 +9,7 @@ from typer import echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import DRAWING, INPUTS, device_of, kind_of, load_pipeline
+from unitouch_gen.cli.loading import DRAWING, device_of, kind_of, load_pipeline
 from unitouch_gen.examples import example
 from unitouch_gen.weights import FAMILY
 
@@ -31,7 +31,7 @@ def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[s
     import torch
 
     pipe = load_pipeline(kind, model=model, dtype=dtype, device=device)
-    inputs = {modality: example("brick", modality) for modality in INPUTS[kind]}
+    inputs = {modality: example("brick", modality) for modality in DRAWING[kind]}
     pipe(**inputs, num_inference_steps=2)  # reads encoders
     started = time.perf_counter()
     report = pipe(**inputs).report

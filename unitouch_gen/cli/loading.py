@@ -17,19 +17,8 @@ from unitouch_gen.weights import JOINT
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
-CLASSES = {
-    "touch-to-image": "TouchToImagePipeline",
-    "x-to-touch": "XToTouchPipeline",
-    "stylization": "TactileStylizationPipeline",
-    "touch-to-text": "TouchToTextPipeline",
-}
-"""Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
-
-DRAWING = ("touch-to-image", "x-to-touch", "stylization")
-"""Those that make images."""
-
-INPUTS = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
-"""What pipelines are given of a contact to be measured on."""
+DRAWING = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
+"""The built-in pipelines that make images, and what they are given of a contact to be measured on."""
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
@@ -82,25 +71,23 @@ def files_in(folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> 
 def load_pipeline(
     name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu", quiet: bool = True, **_others: Any
 ) -> Any:
-    """A pipeline, one of `CLASSES`, by a command's options: of a folder or repository, or built in."""
+    """A pipeline, by its built-in name and a command's options: of a folder or repository, or built in."""
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
     import transformers.utils.logging
 
-    from unitouch_gen import pipelines
-    from unitouch_gen.pipelines.tiny import tiny
+    from unitouch_gen.pipelines.tiny import PIPELINES, tiny
 
     diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # what diffusers logs as an error it raises as well
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
-    take_one_thread(model)
     if model is None:
         pipe: Any = tiny(name, dtype=weights_dtype)
     else:
         folder = folder_of(model)
         with reading("--model", model):
-            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=weights_dtype)
+            pipe = PIPELINES[name].from_pretrained(folder, dtype=weights_dtype)
     pipe.set_progress_bar_config(disable=quiet)
     return pipe.to(place)
 
@@ -108,29 +95,20 @@ def load_pipeline(
 def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     """`UniTouchModel` and `UniTouchProcessor` of a folder, repository or saved pipeline, or the built-in ones."""
     place = device_of(device)
+    import torch
     import transformers.utils.logging
 
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
     transformers.utils.logging.disable_progress_bar()
-    take_one_thread(model)
+    # On a busy machine, threads of networks so small wait for each other, and take forty times as long.
+    if model is None and "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
     folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
         joint, processor = folder / "unitouch", folder / "processor"
     with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
-
-
-def take_one_thread(model: str | None) -> None:
-    """Sets one thread for built-in networks, also outside of a pipeline's call, which does so itself.
-
-    They are so small that more threads save a tenth of the time on an idle machine. On a busy one, threads wait for
-    each other in every layer and take forty times as long.
-    """
-    import torch
-
-    if model is None and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)
 
 
 def folder_of(model: str) -> Path:
@@ -140,10 +118,12 @@ def folder_of(model: str) -> Path:
     return local_folder("--model", model)
 
 
-def kind_of(model: str, kinds: Sequence[str] = DRAWING) -> str:
-    """The name of a saved pipeline, which has to be one of some kinds among `CLASSES`."""
+def kind_of(model: str, kinds: Iterable[str] = DRAWING) -> str:
+    """The built-in name of a saved pipeline, which has to be one of some kinds."""
+    from unitouch_gen.pipelines.tiny import PIPELINES
+
     name = class_name(read_settings("--model", folder_of(model) / "model_index.json"))
-    known = {CLASSES[kind]: kind for kind in kinds}
+    known = {PIPELINES[kind].__name__: kind for kind in kinds}
     if name not in known:
         raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(known)}.")
     return known[name]

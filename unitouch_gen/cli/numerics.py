@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from typer import Exit, Option, echo
 
-from unitouch_gen.cli.loading import DRAWING, INPUTS, kind_of, load_pipeline
+from unitouch_gen.cli.loading import DRAWING, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, did_you_mean
 from unitouch_gen.files import reading
@@ -61,7 +61,7 @@ def work_precision(
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
         name = check_choice("--pipeline", pipeline, DRAWING)
-        pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(INPUTS[name], 4)
+        pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(DRAWING[name], 4)
         turbo = None
         if lora is not None and "turbo" in names:
             with reading("--lora", lora):

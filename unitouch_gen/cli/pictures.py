@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -122,7 +122,6 @@ class Picture:
     inputs: dict[str, Any]  #: its own arguments of the pipeline's call
     file: Path  #: where it goes
     seed: int  #: of its noise
-    settings: dict[str, Any] = field(default_factory=dict)  #: arguments that all pictures of a call have in common
 
 
 def stem_of(value: Path | str) -> str:
@@ -164,11 +163,10 @@ def unique(names: Sequence[str]) -> list[str]:
     return list(found.values())
 
 
-def draw(pipe: Any, pictures: Sequence[Picture]) -> Any:
+def draw(pipe: Any, pictures: Sequence[Picture], settings: dict[str, Any]) -> Any:
     """Output of one call that makes pictures, each from its own seed: a picture is the same alone and among others."""
     import torch
 
-    settings = pictures[0].settings
     generator = [torch.Generator().manual_seed(one.seed) for one in pictures]
     inputs = {name: [one.inputs[name] for one in pictures] for name in pictures[0].inputs}
     return pipe(**{**settings, **inputs}, generator=generator)
@@ -197,13 +195,12 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
     for picture in pictures:
-        picture.settings = settings
         for name in read.keys() & picture.inputs.keys():
             read[name](picture.inputs[name])  # an input that cannot be read should not end the work of hours
     for start in range(0, len(pictures), given["batch_size"]):
         call = pictures[start : start + given["batch_size"]]
         pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(call)} of {len(pictures)}")
-        output = draw(pipe, call)
+        output = draw(pipe, call, settings)
         for place, (picture, image) in enumerate(zip(call, output.images, strict=True)):
             save(image, picture.file)
             rows.append(described(picture, output.report, place))
