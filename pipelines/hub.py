@@ -15,7 +15,6 @@ from typing import Any
 from huggingface_hub import ModelCard, ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
 __all__ = [
@@ -65,9 +64,6 @@ def located(index: Mapping[str, Any]) -> dict[str, Any]:
 class Card:
     """A model card: the README.md saved with a model.
 
-    Raises:
-        InvalidInputError: If a picture is not there.
-
     Example:
         >>> card = Card(figures={"material named right": "73.8 %"}, license="apache-2.0")
         >>> card.license
@@ -80,11 +76,6 @@ class Card:
     license: str = ""  #: its short name, such as "apache-2.0"
     limits: str = "It draws something for every input, also for one that is like nothing it was trained on."
     pictures: Mapping[str, str | Path] = field(default_factory=dict)  #: image files by caption
-
-    def __post_init__(self) -> None:
-        for caption, file in self.pictures.items():
-            if not Path(file).is_file():
-                raise InvalidInputError(f"`pictures` has {str(file)!r} for {caption!r}, which is no file.")
 
     def write(self, folder: Path, name: str, pipe: Any) -> None:
         """Writes README.md and its pictures; its example loads the pipeline by `name`, a folder or repository id."""

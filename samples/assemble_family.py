@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import writing_folder
 from unitouch_gen.schedule import TRAINED
-from unitouch_gen.training.stages import STAGES, command_of, weights_of
+from unitouch_gen.training.stages import STAGES, weights_of
 from unitouch_gen.training.touch_llm import PROMPT
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
@@ -51,6 +51,12 @@ def halve(folder: Path) -> None:
 
 def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def command_of(stage: str, runs: Path) -> str:
+    """What runs a stage, with all outputs in one folder."""
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[stage].items()]
+    return " ".join([f"python -m unitouch_gen.training {stage}", *needs, f"--output {runs / stage}"])
 
 
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:

@@ -102,7 +102,7 @@ class Stage:
         needs = {*NEEDS[name]}
         if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
-            wanted = command_of(name, Path("runs"))
+            wanted = ", ".join(f"--{option} of {before}" for option, before in NEEDS[name].items()) or "none"
             raise InvalidInputError(f"{name} needs folders of models: {wanted}; it got {given}.")
         self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
         if resume and before["inputs"] != self.inputs:
@@ -204,13 +204,6 @@ class Stage:
             model.mkdir()
             yield model
             (model.parent / "record.json").write_text(json.dumps(record, indent=2) + "\n")
-
-
-def command_of(name: str, runs: Path) -> str:
-    """What runs a stage, with all outputs in one folder."""
-    places = {option: runs / before / "model" if before in STAGES else before for option, before in NEEDS[name].items()}
-    needs = [f"--{option} {place}" for option, place in places.items()]
-    return " ".join([f"python -m unitouch_gen.training {name}", *needs, f"--output {runs / name}"])
 
 
 def weights_of(folder: Path) -> str:

@@ -20,7 +20,7 @@ import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.utils import send_to_device, set_seed
 from diffusers.training_utils import EMAModel
-from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
@@ -49,10 +49,7 @@ class TrainerConfig(Settings):
     beta2: Decay = 0.98
     grad_clip: NonNegativeFloat = 1.0  # largest gradient norm; 0 switches clipping off
     ema_decay: Decay = 0.0  # of the averaged weights, which are kept; 0 keeps the raw ones
-    mixed_precision: Annotated[
-        Literal["no", "fp16", "bf16"],
-        BeforeValidator(lambda value: "no" if value is False else value),  # as YAML 1.1 reads a bare no
-    ] = "no"
+    mixed_precision: Literal["no", "fp16", "bf16"] = "no"
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise

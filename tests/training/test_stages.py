@@ -14,14 +14,14 @@ from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from assemble_family import assemble
+from assemble_family import assemble, command_of
 from tests.helpers.components import AUDIO, SPACE
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import STAGES, Stage, command_of, weights_of
+from unitouch_gen.training.stages import STAGES, Stage, weights_of
 from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
@@ -188,7 +188,7 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         ("touch_vae", "--recipe touch_vae_paper", "`data` takes one of the two"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
-        ("touch", "", "touch needs folders of models: python -m unitouch_gen.training touch --joint"),
+        ("touch", "", "touch needs folders of models: --joint of "),
         ("audio", "--joint nowhere", "'nowhere' does not exist"),
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),

@@ -9,7 +9,7 @@ from typer import Exit, Option, echo
 
 from unitouch_gen.cli.loading import DRAWING, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, did_you_mean
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.files import reading
 from unitouch_gen.weights import FAMILY
 
@@ -85,7 +85,6 @@ def work_precision(
 def stability(
     model: Model = None,
     only: Annotated[str | None, Option(help="Name of the one case to run.")] = None,
-    list_cases: Annotated[bool, Option("--list", metavar="", help="List the cases, and run none.")] = False,
 ) -> None:
     """Runs solvers and pipelines on stiff and extreme input; exits with 1 if a case fails.
 
@@ -100,12 +99,7 @@ def stability(
         return load_pipeline(kind, model=model, dtype=str(dtype).removeprefix("torch."))
 
     known = {case.name: case for case in cases(load, [*DRAWING] if model is None else [kind_of(model)])}
-    if only is not None and only not in known:
-        raise InvalidInputError(f"Unknown case {only!r}; --list shows them. {did_you_mean(only, known)}".rstrip())
-    table = [*known.values()] if only is None else [known[only]]
-    if list_cases:
-        print_table(["case", "reason of the bound"], [[case.name, case.reason] for case in table])
-        return
+    table = [*known.values()] if only is None else [known[check_choice("--only", only, known)]]
     diffusers.utils.logging.set_verbosity_error()
     rows, failed = [], 0
     with warnings.catch_warnings():
@@ -118,8 +112,8 @@ def stability(
             else:
                 ok, figures = value <= bound, [f"{bound:.2g}", f"{value:.2g}"]
             failed += not ok
-            rows.append([case.name, *figures, "ok" if ok else "FAILED"])
-    print_table(["case", "bound", "result", ""], rows)
+            rows.append([case.name, case.reason, *figures, "ok" if ok else "FAILED"])
+    print_table(["case", "reason of the bound", "bound", "result", ""], rows)
     echo(f"{len(rows) - failed} of {len(rows)} cases hold.")
     if failed:
         raise Exit(1)

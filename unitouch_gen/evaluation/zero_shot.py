@@ -52,9 +52,6 @@ class ZeroShotTouchClassifier:
         model: With touch and text.
         processor: Of both.
 
-    Raises:
-        InvalidInputError: If the processor has no tokenizer.
-
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
         >>> from unitouch_gen import example
@@ -65,8 +62,6 @@ class ZeroShotTouchClassifier:
     """
 
     def __init__(self, model: UniTouchModel, processor: UniTouchProcessor):
-        if processor.tokenizer is None:
-            raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
         self.model, self.processor = model, processor
 
     @torch.no_grad()
@@ -93,8 +88,8 @@ class ZeroShotTouchClassifier:
             raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
         pixels = self.processor.touch(touch).to(self.model.device)
         matches = self.model.match_sensors(pixels, sensor)
-        features, unknown = self.model.encode_touches(pixels, self.model.sensor_ids(matches))
         texts = text_embeddings(self.model, self.processor, [template.format(name) for name in names])
+        features, unknown = self.model.encode_touches(pixels, self.model.sensor_ids(matches))
         cosines = F.normalize(features.float(), dim=-1) @ texts.T
         shares = (cosines / self.model.config.temperature).softmax(dim=1)
         best = shares.topk(min(top or len(names), len(names)))

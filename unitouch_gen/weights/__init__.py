@@ -18,4 +18,3 @@ TOUCH_TO_IMAGE, X_TO_TOUCH, TOUCH_TO_TEXT = (FAMILY / of for of in ("touch-to-im
 PICTURE_CLASSIFIER, TOUCH_CLASSIFIER = FAMILY / "picture-classifier", FAMILY / "touch-classifier"
 FIGURES = FAMILY / "family.json"
 CARDS = FAMILY / "cards"
-"""A picture for each pipeline, which `samples/card_pictures.py` draws."""
