@@ -49,7 +49,7 @@ class TrainerConfig(Settings):
     beta2: Decay = 0.98
     grad_clip: NonNegativeFloat = 1.0  # largest gradient norm; 0 switches clipping off
     ema_decay: Decay = 0.0  # of the averaged weights, which are kept; 0 keeps the raw ones
-    mixed_precision: Literal["no", "fp16", "bf16"] = "no"
+    mixed_precision: Literal["fp16", "bf16"] | None = None
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise
@@ -76,7 +76,7 @@ class Trainer:
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds = 0, 0.0
         self.accelerator = Accelerator(
-            mixed_precision=config.mixed_precision,
+            mixed_precision=config.mixed_precision or "no",
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
         )
         self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes
@@ -212,6 +212,7 @@ def rate_at(step: int, config: TrainerConfig, steps: int) -> float:
 def _optimizer(module: nn.Module, config: TrainerConfig) -> torch.optim.Optimizer:
     """AdamW, with decay of the weights of linear and convolution layers; tokens, tables, norms and biases have none."""
     weights = {id(layer.weight) for layer in module.modules() if isinstance(layer, nn.Linear | _ConvNd)}
+    weights |= {id(layer.in_proj_weight) for layer in module.modules() if isinstance(layer, nn.MultiheadAttention)}
     trained = [p for p in module.parameters() if p.requires_grad]
     decayed, others = [p for p in trained if id(p) in weights], [p for p in trained if id(p) not in weights]
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]

@@ -83,7 +83,7 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line() -> None:
         ("touch", "trainer.stpes=3", r"In `trainer`, `stpes` is unknown; .*Did you mean 'steps'\?$"),
         ("touch", "trainer.batch_size=null", r"`trainer\.batch_size` is None; it has to be a valid integer"),
         ("touch", "trainer.steps=0", r"`trainer\.steps` is 0; it has to be greater than 0"),
-        ("touch", "trainer.mixed_precision=int8", r"`trainer\.mixed_precision` is 'int8'; it has to be 'no', "),
+        ("touch", "trainer.mixed_precision=int8", r"`trainer\.mixed_precision` is 'int8'; it has to be 'fp16'"),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
         ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
     ):  # fmt: skip

@@ -109,9 +109,10 @@ def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Pa
     names = {id(parameter): name for name, parameter in model.named_parameters()}
     groups = [group["params"] for group in trainer.optimizer.param_groups if group["weight_decay"]]
     decayed = {names[id(parameter)] for group in groups for parameter in group}
-    kinds = {name: type(model.get_submodule(name.rpartition(".")[0])).__name__ for name in names.values()}
-    assert decayed == {name for name in kinds if kinds[name] in ("Linear", "Conv2d") and name.endswith(".weight")}
-    assert {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in {*kinds} - decayed}
+    kinds = {name: type(model.get_submodule(name.rpartition(".")[0])) for name in names.values()}
+    layers = {name for name, kind in kinds.items() if issubclass(kind, (nn.Linear, nn.Conv2d, nn.MultiheadAttention))}
+    assert decayed == {name for name in layers if name.endswith((".weight", ".in_proj_weight"))}
+    assert {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name].__name__ for name in {*kinds} - decayed}
 
 
 @pytest.mark.parametrize(("killed_at", "ema_decay"), [(5, 0.9), (13, 0.0)])
