@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -168,8 +169,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
         check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
         scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_SCALE)
-        if (num_inference_steps, solver, tolerance, init_strength) == (None, None, None, 1.0):
-            timesteps = self._default("timesteps", timesteps)
+        own = timesteps is None and (solver, tolerance, init_strength) == (None, None, 1.0)
+        usual = num_inference_steps in (None, self.config.default_num_inference_steps)
+        if own and usual and "timesteps" in signature(self.scheduler.set_timesteps).parameters:
+            timesteps, num_inference_steps = self.config.default_timesteps, None
         if timesteps is None and tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         steps = prepare_steps(

@@ -15,6 +15,7 @@ from typing import Any
 from huggingface_hub import ModelCard, ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
+from unitouch_gen.files import check_file
 from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
 __all__ = [
@@ -81,6 +82,7 @@ class Card:
         """Writes README.md and its pictures; its example loads the pipeline by `name`, a folder or repository id."""
         places: dict[str, str] = {}
         for number, (caption, file) in enumerate(self.pictures.items()):
+            check_file("pictures", file, "an image file")
             places[caption] = f"{PICTURES}/{number}-{Path(file).name}"
             (folder / PICTURES).mkdir(exist_ok=True)
             shutil.copyfile(file, folder / places[caption])

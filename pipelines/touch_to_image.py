@@ -126,8 +126,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             prompt: One prompt, or one for each touch; default "high quality".
             height, width: Picture size in pixels; multiples of the VAE's scale factor.
             num_inference_steps: Number of solver steps.
-            timesteps: Those at which the pipeline's own scheduler evaluates the network, falling, in place of their
-                number, for distilled weights that were learnt at them.
+            timesteps: Descending timesteps of the pipeline's own scheduler, in place of their number.
             guidance_scale: s of classifier-free guidance, >= 0; active above 1.
             strength: Factor on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: Prompt of the unconditional branch; default empty.

@@ -49,7 +49,10 @@ def as_batch(frame: np.ndarray) -> Tensor:
 def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
     """Contacts of a stream, each when it is as firm as it gets; and again if it gets firmer by a twentieth."""
     numbered = enumerate(frames)
-    first = torch.cat([as_batch(frame) for _, (_, frame) in zip(range(REST), numbered, strict=False)])
+    quiet = [as_batch(frame) for _, (_, frame) in zip(range(REST), numbered, strict=False)]
+    if len(quiet) < REST:
+        raise SystemExit("The stream ended before the gel was seen at rest.")
+    first = torch.cat(quiet)
     rest = first.median(dim=0, keepdim=True).values
     least = max(LEAST_CHANGE, 3.0 * change_of(first, rest).max().item())  # more where they are noisy
 

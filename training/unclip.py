@@ -13,6 +13,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.training.batches import ArrayDataset, Batch
@@ -107,6 +108,8 @@ def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayD
 
 
 def main(stage: Stage, recipe: UnclipRecipe) -> None:
+    if recipe.objective.caption_share + recipe.objective.empty_share > 1.0:
+        raise InvalidInputError("`caption_share` and `empty_share` are more than 1 together; lower one.")
     joint = stage.joint_space("image", "text")
     unet = stage.unet(recipe.model)
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)

@@ -132,8 +132,8 @@ def prepare_steps(
 ) -> Steps:  # fmt: skip
     """Validates the step arguments of a call, before any network runs.
 
-    `num_inference_steps` (default 50), `timesteps` of the pipeline's own scheduler, or `tolerance`, a relative RMS
-    error of the latents from 1e-5 to 1, sets the steps. Without `solver` and `tolerance` a copy of that scheduler runs;
+    Steps are given by one of three: `num_inference_steps` (default 50); `timesteps` of `scheduler`; or `tolerance`, a
+    relative RMS error of the latents from 1e-5 to 1. Without `solver` and `tolerance` a copy of the scheduler runs;
     otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of a tolerance,
     `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of the way to
     noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or
@@ -153,11 +153,9 @@ def prepare_steps(
     if max_evaluations is not None:
         raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
     if timesteps is not None:
-        partial = init_strength if init_strength < 1.0 else None
-        check_unused("timesteps", num_inference_steps=num_inference_steps, solver=solver, init_strength=partial)
-        highest = config.get("num_train_timesteps", 1000) - 1
+        check_unused("timesteps", num_inference_steps=num_inference_steps, solver=solver)
         check_kind("timesteps", timesteps, list, tuple)
-        falling = [check_integer("timesteps", timestep, 0, highest) for timestep in timesteps]
+        falling = [check_integer("timesteps", one, 0, config.get("num_train_timesteps", 1000) - 1) for one in timesteps]
         if not falling or falling != sorted(set(falling), reverse=True):
             raise InvalidInputError(f"`timesteps` is {describe(timesteps)}; each has to be below the one before.")
         return prepare_scheduler(copy.deepcopy(scheduler), falling, eta, 1.0, device)

@@ -153,7 +153,7 @@ def answer(pipe: Any, kind: str, given: dict[str, Any], progress: gradio.Progres
 
     generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
     output, felt = pipe(**given, generator=generator, callback_on_step_end=show), ""
-    if kind == "touch-to-image" and pipe.processor.tokenizer is not None:  # or the joint space reads no words
+    if kind == "touch-to-image" and "text" in pipe.unitouch.known_modalities and pipe.processor.tokenizer is not None:
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier(given["touch"], sensor=given.get("sensor"), top=3)[0])
     return output.images, felt, str(output.report), str(seed)

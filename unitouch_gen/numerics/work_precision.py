@@ -104,8 +104,6 @@ def pipeline_target(
     ) -> tuple[Tensor, RunReport]:
         called = copy.copy(turbo if solver == "turbo" else pipe)
         called.scheduler = scheduler_of(solver, called.scheduler)
-        if solver in ("default", "turbo") and steps == called.config["default_num_inference_steps"]:
-            steps = None  # or timesteps that it was distilled for would not be taken
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnfamiliarInputWarning)
             output = called(
