@@ -67,7 +67,7 @@ def _decoded(name: str, image: Any) -> np.ndarray:
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
         tags = getattr(image, "tag_v2", {})  # of TIFF: bits, whether zero is white, whether it is stored by planes
-        if tags.get(258, (8,))[0] > 8 and (tags.get(262) == 0 or (tags.get(284) == 2 and tags.get(277, 1) > 1)):
+        if tags.get(258, (8,))[0] > 8 and (tags.get(262) == 0 or tags.get(284) == 2):
             kind = "a TIFF of more than 8 bits, of planes or with white as zero"
             raise InvalidInputError(f"{subject} is {kind}, which Pillow misreads; save it as PNG.")
         image = ImageOps.exif_transpose(image)

@@ -77,8 +77,8 @@ class SensorBank(nn.Module):
     def match(self, raw_pixels: Tensor, sensor: Sensors = None, *, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each image (B, 3, S, S) in [0, 1]: the one named, or the one that is retrieved.
 
-        That is the nearest prototype by L1 distance (as in the paper) of mean colours of 8 x 8 areas. Where the bank has
-        `reaches`, it is none where the image is out of reach of all, unless the `nearest` is asked for.
+        That is the nearest prototype by L1 distance (as in the paper) of mean colours of 8 x 8 areas. Where the bank
+        has `reaches`, it is none where the image is out of reach of all, unless the `nearest` is asked for.
         """
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
