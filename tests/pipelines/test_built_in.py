@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 import torch
-from diffusers import LCMScheduler
+from diffusers import DDIMScheduler, LCMScheduler
 from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
@@ -130,9 +130,12 @@ def test_it_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo,
     output = draw(turbo, name)
     assert (output.report.evaluations, output.report.guided) == (4, 0)
     assert "unconditional branch" in output.report.left_out
+    assert torch.equal(draw(turbo, name, num_inference_steps=4).images, output.images)  # as a page passes it
     for steps in (2, 8):
         assert draw(turbo, name, num_inference_steps=steps).report.evaluations == steps
     assert draw(turbo, name, guidance_scale=2.0).report.guided == 4
+    turbo.scheduler = DDIMScheduler.from_config(turbo.scheduler.config)  # which takes no timesteps
+    assert draw(turbo, name).report.evaluations == 4
 
 
 def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo, name, family):
