@@ -139,8 +139,9 @@ def test_a_sensor_is_known_by_its_name_or_by_its_background(x_to_touch, tmp_path
         assert len(draw(nameless, **{"text": "brick", **given}, num_images_per_prompt=2)) == made
     pipe.save_pretrained(tmp_path)
     again = quiet(XToTouchPipeline.from_pretrained(tmp_path))
-    given = {"text": "brick", "sensor": "digit"}
-    assert_close(draw(again, **given), draw(pipe, **given), atol=1e-5, rtol=1e-5)
+    given = {"condition_embeds": pipe.encode_condition(text="brick"), "sensor": "digit"}
+    assert torch.equal(draw(again, **given), draw(pipe, **given))
+    assert_close(again.encode_condition(text="brick"), given["condition_embeds"], atol=1e-6, rtol=0)
 
 
 def test_sensors_and_backgrounds_that_do_not_fit_are_refused(x_to_touch):
