@@ -158,9 +158,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     def _check_call(
         self, inputs: int, num_images_per_prompt: Any, height: Any, width: Any, num_inference_steps: Any,
-        timesteps: Any, guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any,
-        generator: Any, latents: Any, output_type: Any, cross_attention_kwargs: Any, callback: Any,
-        callback_inputs: Any, throw: Any, init_strength: Any = 1.0,
+        guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any, generator: Any, latents: Any,
+        output_type: Any, cross_attention_kwargs: Any, callback: Any, callback_inputs: Any, throw: Any,
+        init_strength: Any = 1.0, timesteps: Any = None,
     ) -> CallSettings:  # fmt: skip
         """The validated arguments of a call with `inputs` inputs; `None` is the checkpoint's default."""
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, 100_000)

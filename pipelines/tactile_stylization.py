@@ -131,9 +131,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         fewer, batch_size = sorted((len(photos), len(touches.pixels)))
         check_count("image, touch", fewer, batch_size)
         settings = self._check_call(
-            batch_size, num_images_per_prompt, height, width, num_inference_steps, None, guidance_scale, solver,
-            tolerance, max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs,
-            callback_on_step_end, callback_on_step_end_tensor_inputs, throw, init_strength,
+            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw, init_strength,
         )  # fmt: skip
         positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
         prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)

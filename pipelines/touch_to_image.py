@@ -185,9 +185,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         touches = None if touch is None else self._prepare_touch(touch, sensor, background)
         inputs = len(embeds if touches is None else touches.pixels)
         settings = self._check_call(
-            inputs, num_images_per_prompt, height, width, num_inference_steps, timesteps, guidance_scale, solver,
-            tolerance, max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs,
-            callback_on_step_end, callback_on_step_end_tensor_inputs, throw,
+            inputs, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw, timesteps=timesteps,
         )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
         positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)

@@ -197,9 +197,9 @@ class XToTouchPipeline(UniTouchPipeline):
         gels, sensor_labels = self._check_sensor(sensor, background, inputs)
         batch_size = len(sensor_labels)
         settings = self._check_call(
-            batch_size, num_images_per_prompt, height, width, num_inference_steps, timesteps, guidance_scale, solver,
-            tolerance, max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs,
-            callback_on_step_end, callback_on_step_end_tensor_inputs, throw,
+            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
+            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
+            callback_on_step_end_tensor_inputs, throw, timesteps=timesteps,
         )  # fmt: skip
 
         # 2. Encode the condition

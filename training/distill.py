@@ -219,7 +219,6 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     with stage.saving() as place:
         halves = {name: tensor.half() for name, tensor in layers.items()}
         StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)
-        timesteps = recipe.objective.timesteps
-        defaults = {"num_inference_steps": len(timesteps), "timesteps": timesteps, "guidance_scale": 1.0}
-        settings = {f"default_{name}": value for name, value in defaults.items()}
-        (place / "defaults.json").write_text(json.dumps(settings, indent=2) + "\n")
+        steps = recipe.objective.timesteps
+        drawn = {"default_num_inference_steps": len(steps), "default_timesteps": steps, "default_guidance_scale": 1.0}
+        (place / "defaults.json").write_text(json.dumps(drawn, indent=2) + "\n")

@@ -156,11 +156,8 @@ class Stage:
 
     def image_embeddings(self, model: UniTouchModel, splits: list[Contacts]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised."""
-
-        def compute() -> Tensor:
-            return torch.cat([image_embeddings(model.eval(), "image", split.image) for split in splits])
-
-        return self.computed_once("image-embeddings", "joint", splits, compute)
+        parts = (image_embeddings(model.eval(), "image", split.image) for split in splits)  # computed when asked for
+        return self.computed_once("image-embeddings", "joint", splits, lambda: torch.cat([*parts]))
 
     def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
