@@ -13,8 +13,9 @@ from transformers import AutoTokenizer, LlamaForCausalLM
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, needed
-from unitouch_gen.files import as_path, class_name, read_settings, reading
+from unitouch_gen.files import as_path, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
@@ -72,8 +73,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             parts["tokenizer"] = AutoTokenizer.from_pretrained(language)
         else:
             vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
-            autoencoder = class_name(read_settings("family", vae / "config.json"))
-            parts["vae"] = stored(getattr(diffusers, str(autoencoder)), vae)
+            autoencoder = read_settings("family", vae / "config.json").get("_class_name")
+            parts["vae"] = stored(autoencoder_class("vae", autoencoder), vae)
             parts["unet"] = stored(UNet2DConditionModel, folder / "unet")
             scheduler = read_settings("family", folder / "scheduler" / "scheduler_config.json")["_class_name"]
             parts["scheduler"] = getattr(diffusers, scheduler).from_pretrained(folder / "scheduler")

@@ -10,7 +10,6 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-import diffusers
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -18,9 +17,16 @@ from diffusers import AutoencoderTiny, VQModel
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import in_batches
-from unitouch_gen.models.autoencoders import CLASSES, Autoencoder, encode, encode_raw, read_autoencoder, scale_factor
+from unitouch_gen.models.autoencoders import (
+    Autoencoder,
+    autoencoder_class,
+    encode,
+    encode_raw,
+    read_autoencoder,
+    scale_factor,
+)
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.recipe import Arguments, Settings, build
@@ -103,8 +109,8 @@ def cached_latents(
 
 def make_autoencoder(model: Arguments) -> Autoencoder:
     """The autoencoder of a recipe's `model`."""
-    name = check_choice("model.class", model.get("class"), CLASSES)
-    return build("model", getattr(diffusers, name), {key: value for key, value in model.items() if key != "class"})
+    kind = autoencoder_class("model.class", model.get("class"))
+    return build("model", kind, {key: value for key, value in model.items() if key != "class"})
 
 
 def main(stage: Stage, recipe: AutoencoderRecipe) -> None:

@@ -82,6 +82,7 @@ def load_pipeline(
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
+    take_one_thread(model)
     if model is None:
         pipe: Any = tiny(name, dtype=weights_dtype)
     else:
@@ -95,20 +96,28 @@ def load_pipeline(
 def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     """`UniTouchModel` and `UniTouchProcessor` of a folder, repository or saved pipeline, or the built-in ones."""
     place = device_of(device)
-    import torch
     import transformers.utils.logging
 
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
     transformers.utils.logging.disable_progress_bar()
-    # On a busy machine, threads of networks so small wait for each other, and take forty times as long.
-    if model is None and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)
+    take_one_thread(model)
     folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
         joint, processor = folder / "unitouch", folder / "processor"
     with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
+
+
+def take_one_thread(model: str | None) -> None:
+    """Sets one thread for built-in networks, also outside of a pipeline's call, which does so itself.
+
+    On a busy machine, threads of networks so small wait for each other in every layer, and take forty times as long.
+    """
+    import torch
+
+    if model is None and "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
 
 
 def folder_of(model: str) -> Path:

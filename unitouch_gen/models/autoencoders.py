@@ -4,9 +4,8 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 """
 
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-import diffusers
 import torch
 from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
@@ -16,14 +15,18 @@ from unitouch_gen.files import read_settings
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderTiny | VQModel
 
-CLASSES = ("AutoencoderKL", "AutoencoderTiny", "VQModel")  # their classes' names in diffusers
+CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderTiny, VQModel)}
+
+
+def autoencoder_class(argument: str, name: Any) -> Any:
+    """The class of that name in diffusers' configurations; raises an `InvalidInputError` if there is none."""
+    return CLASSES[check_choice(argument, name, CLASSES)]
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:
     """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
-    name = check_choice("vae", read_settings("vae", folder / "config.json").get("_class_name"), CLASSES)
-    vae = getattr(diffusers, name).from_pretrained(folder, use_safetensors=True)
-    return vae.eval().requires_grad_(False)
+    kind = autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
+    return kind.from_pretrained(folder, use_safetensors=True).eval().requires_grad_(False)
 
 
 def scale_factor(vae: Autoencoder) -> int:
