@@ -87,8 +87,8 @@ def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_
 @pytest.mark.parametrize(
     "content",
     [
-        "Touch,Seed\na.png,1\n\n", "touch;seed\r\na.png;1\r\n", "touch\tseed\ra.png\t1\r",
-        "touch,seed,,\na.png,1,,\n,,,", "\n touch , seed\na.png, 1",
+        "Touch,Seed\na.png,1\n\n", "touch;seed\r\na.png;1\r\n", "touch\tseed\ra.png\t1\r", "sep=;\ntouch;seed\na.png;1",
+        "touch,seed,,\na.png,1,,\n,,,", '"sep=|"\ntouch|seed\n"a.png"|1', "\n touch , seed\na.png, 1",
         ",touch,seed\n0,a.png,1",
     ],
 )  # fmt: skip

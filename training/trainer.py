@@ -20,7 +20,7 @@ import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.utils import send_to_device, set_seed
 from diffusers.training_utils import EMAModel
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
+from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
@@ -49,7 +49,10 @@ class TrainerConfig(Settings):
     beta2: Decay = 0.98
     grad_clip: NonNegativeFloat = 1.0  # largest gradient norm; 0 switches clipping off
     ema_decay: Decay = 0.0  # of the averaged weights, which are kept; 0 keeps the raw ones
-    mixed_precision: Literal["fp16", "bf16"] | None = None
+    mixed_precision: Annotated[
+        Literal["no", "fp16", "bf16"],
+        BeforeValidator(lambda value: "no" if value is False else value),  # as YAML 1.1 reads a bare no
+    ] = "no"
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise
@@ -76,7 +79,7 @@ class Trainer:
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds = 0, 0.0
         self.accelerator = Accelerator(
-            mixed_precision=config.mixed_precision or "no",
+            mixed_precision=config.mixed_precision,
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
         )
         self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes

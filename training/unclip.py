@@ -5,11 +5,12 @@
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from pydantic import model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
@@ -32,6 +33,12 @@ class UnclipSettings(Settings):
     clean_share: Share  # of the embeddings at noise level 0; the levels of the others are uniform
     gain: Share  # lowest on the embedding; uniform up to 1, so that a strength below 1 is known in training
     step_power: StepPower
+
+    @model_validator(mode="after")
+    def _prompts_are_at_most_all(self) -> Self:
+        if self.caption_share + self.empty_share > 1.0:
+            raise InvalidInputError("`caption_share` and `empty_share` are more than 1 together; lower one.")
+        return self
 
 
 class UnclipRecipe(Recipe):
@@ -108,8 +115,6 @@ def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayD
 
 
 def main(stage: Stage, recipe: UnclipRecipe) -> None:
-    if recipe.objective.caption_share + recipe.objective.empty_share > 1.0:
-        raise InvalidInputError("`caption_share` and `empty_share` are more than 1 together; lower one.")
     joint = stage.joint_space("image", "text")
     unet = stage.unet(recipe.model)
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)

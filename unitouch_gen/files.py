@@ -200,7 +200,9 @@ def read_text(file: Path) -> str:
 def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
     """The rows of a table, parted by commas, semicolons or tabs, by the names in its first line; without blank ones."""
     text = read_text(file)
-    delimiter = max(",;\t", key=text.lstrip().partition("\n")[0].count)
+    if said := re.match(r'"?sep=(.)"?\r?\n', text):  # to Excel
+        text = text[said.end() :]
+    delimiter = said[1] if said else max(",;\t", key=text.lstrip().partition("\n")[0].count)
     lines = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
     try:
         cells = [[cell.strip() for cell in row] for row in lines if any(map(str.strip, row))]

@@ -83,9 +83,10 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line() -> None:
         ("touch", "trainer.stpes=3", r"In `trainer`, `stpes` is unknown; .*Did you mean 'steps'\?$"),
         ("touch", "trainer.batch_size=null", r"`trainer\.batch_size` is None; it has to be a valid integer"),
         ("touch", "trainer.steps=0", r"`trainer\.steps` is 0; it has to be greater than 0"),
-        ("touch", "trainer.mixed_precision=int8", r"`trainer\.mixed_precision` is 'int8'; it has to be 'fp16'"),
+        ("touch", "trainer.mixed_precision=int8", r"`trainer\.mixed_precision` is 'int8'; it has to be 'no', "),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
         ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
+        ("unclip", "objective.caption_share=0.9", "In `objective`, `caption_share` and `empty_share` are more than 1"),
     ):  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=message) as raised:
             read_as(name, *override.split())

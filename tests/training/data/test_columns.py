@@ -116,7 +116,7 @@ def test_splits_by_objects_are_disjoint_whole_and_do_not_depend_on_the_order(cou
 
 
 def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path, joint: str) -> None:
-    settings = ["trainer.steps=2", "trainer.batch_size=4", "trainer.warmup=1", "trainer.mixed_precision=null",
+    settings = ["trainer.steps=2", "trainer.batch_size=4", "trainer.warmup=1", "trainer.mixed_precision=no",
                 f"data.sets=[{{path: {folder}, split: object}}]",
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
     words = ["touch", "--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
