@@ -82,9 +82,8 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
         rows["touch to its picture, within material"] = found_within(touch, embeds["image"], material, size)
     fifths, usual = contacts.objects % 5, torch.empty_like(truth[:, 0])
     for fifth in fifths.unique():
-        fit, asked = fifths != fifth, fifths == fifth  # a mean that holds a contact itself would agree with it
-        for one in material.unique():
-            usual[asked & (material == one)] = truth[fit & (material == one), 0].mean(dim=0)
+        fit, asked = fifths != fifth, fifths == fifth
+        usual[asked] = class_means(truth[fit, 0], material[fit], material[asked])
     read = cross_predicted(touch, truth[:, 0], fifths)
     found = agreed(read, usual, truth[:, 0], ATTRIBUTES, real.attributes)
     return rows | {f"touch, read linearly: {name}": row for name, row in found.items()}

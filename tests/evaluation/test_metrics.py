@@ -28,6 +28,7 @@ def test_class_means_are_those_of_each_class():
     for label in range(4):
         expected = values[label == LABELS].mean(dim=0).expand(20, -1, -1)
         torch.testing.assert_close(means[label == LABELS], expected)
+    torch.testing.assert_close(class_means(values, LABELS, torch.tensor([3, 1])), means[[3, 1]])
 
 
 def test_controls_stand_beside_each_figure():

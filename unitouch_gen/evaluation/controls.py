@@ -31,11 +31,15 @@ def others(count: int) -> Tensor:
     return torch.empty_like(order).scatter_(0, order, order.roll(1))
 
 
-def class_means(values: Tensor, labels: Tensor) -> Tensor:
-    """The mean of each sample's class, of values (N, ...) with labels from 0, int64 (N,)."""
-    member = F.one_hot(labels).to(values)  # (N, classes)
+def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> Tensor:
+    """The mean of each sample's class, of values (N, ...) with labels from 0, int64 (N,).
+
+    `asked` are classes (M,) of other samples, to give the means of: a mean that holds a sample itself agrees with it.
+    """
+    asked = labels if asked is None else asked
+    member = F.one_hot(labels, int(max(labels.max(), asked.max())) + 1).to(values)  # (N, classes)
     means = (member / member.sum(dim=0).clamp_min(1.0)).T @ values.flatten(1)
-    return means[labels].view_as(values)
+    return means[asked].view(-1, *values.shape[1:])
 
 
 def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
