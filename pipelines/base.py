@@ -44,7 +44,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import as_path, local_folder, reading, writing_folder
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
-from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
+from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes

@@ -15,7 +15,7 @@ from typing import Any
 from huggingface_hub import ModelCard, ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
-from unitouch_gen.files import check_file
+from unitouch_gen.errors import check_file
 from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
 __all__ = [

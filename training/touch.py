@@ -19,7 +19,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance, touch_statistics
+from unitouch_gen.models.joint import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of

@@ -20,8 +20,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, first_line
-from unitouch_gen.files import as_path, check_file, writing_folder
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_file, check_finite, check_kind, first_line
+from unitouch_gen.files import as_path, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer

@@ -6,6 +6,7 @@ names the argument, what came, and what to do.
 
 import io
 import math
+import os
 import sys
 import warnings
 from collections.abc import Iterable
@@ -145,6 +146,13 @@ def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "
         return value
     wanted = f"it has to be one of {', '.join(map(repr, choices))}. {did_you_mean(value, choices)} {hint}"
     raise InvalidInputError(f"`{name}` is {describe(value)}; {wanted}".strip())
+
+
+def check_file(name: str, path: str | os.PathLike, what: str) -> None:
+    """Raises `InvalidInputError` if there is no file of that path; `what` should be there, such as "an image file"."""
+    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        why = "is a folder" if os.path.isdir(path) else "is no file" if os.path.exists(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
 
 def check_unused(instead: str, **given: Any) -> None:

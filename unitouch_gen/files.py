@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, check_kind, describe, first_line
+from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
@@ -139,13 +139,6 @@ def as_path(name: str, place: Any) -> Path:
     if not str(check_kind(name, place, str, os.PathLike)) or "\0" in str(place):
         raise InvalidInputError(f"`{name}` is {describe(str(place))}; it has to be the path of a file or folder.")
     return Path(place).expanduser()
-
-
-def check_file(name: str, path: str | os.PathLike, what: str) -> None:
-    """Raises `InvalidInputError` if there is no file of that path; `what` should be there, such as "an image file"."""
-    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
-        why = "is a folder" if os.path.isdir(path) else "is no file" if os.path.exists(path) else "does not exist"
-        raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
 
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:

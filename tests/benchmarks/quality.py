@@ -41,7 +41,7 @@ from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_r
 from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
-from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
+from unitouch_gen.models.joint import UNLIKE, UNTOUCHED
 from unitouch_gen.models.relief import relief
 from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
 from unitouch_gen.training.data.heldout import FIRST_SEED

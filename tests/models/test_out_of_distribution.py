@@ -8,7 +8,7 @@ from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, touch_statistics, warn_of_unknown
+from unitouch_gen.models.joint import UNLIKE, UNTOUCHED, touch_statistics, warn_of_unknown
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World, draw_sensor
 

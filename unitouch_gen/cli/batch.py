@@ -12,8 +12,8 @@ from unitouch_gen import errors
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, first_line
-from unitouch_gen.files import check_file, files_below, read_table
+from unitouch_gen.errors import InvalidInputError, check_choice, check_file, check_integer, first_line
+from unitouch_gen.files import files_below, read_table
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")

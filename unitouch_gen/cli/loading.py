@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.cli.options import note
-from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_file
 from unitouch_gen.examples import example
-from unitouch_gen.files import check_file, class_name, is_hidden, local_folder, natural, read_settings, reading
+from unitouch_gen.files import class_name, is_hidden, local_folder, natural, read_settings, reading
 from unitouch_gen.weights import JOINT
 
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
@@ -27,7 +27,7 @@ def suffixes_of(modality: str) -> frozenset[str]:
     """Suffixes of the files in a folder that are taken for "touch", "image" or "audio"."""
     from unitouch_gen.models.videos import VIDEOS
 
-    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
+    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES.union(VIDEOS)}[modality]
 
 
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:

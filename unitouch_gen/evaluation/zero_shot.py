@@ -12,8 +12,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_kind, check_texts
 from unitouch_gen.models.images import ImageInput
-from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.out_of_distribution import UNTOUCHED
+from unitouch_gen.models.joint import UNTOUCHED, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.world import MATERIAL_NAMES
 

@@ -14,8 +14,7 @@ from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe, first_line
-from unitouch_gen.files import check_file
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_finite, describe, first_line
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
 

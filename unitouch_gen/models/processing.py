@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, ch
 from unitouch_gen.files import local_folder, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
-from unitouch_gen.models.videos import firmest
+from unitouch_gen.models.videos import VIDEOS, firmest
 
 LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
 
@@ -36,6 +37,12 @@ def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
         if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
             raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
         return CLIPTokenizer.from_pretrained(folder)
+
+
+def _still(name: str, touch: Any) -> Any:
+    """A touch, or of a video or an iterator the frame to take."""
+    video = isinstance(touch, str | os.PathLike) and str(touch).lower().endswith(VIDEOS)
+    return firmest(name, touch) if video or isinstance(touch, Iterator) else touch
 
 
 class UniTouchProcessor(FeatureExtractionMixin):
@@ -81,8 +88,8 @@ class UniTouchProcessor(FeatureExtractionMixin):
         Of a video or an iterator of frames it is the frame of firmest contact; see `videos.firmest`.
         """
         if isinstance(touch, list | tuple):
-            return self.images([firmest(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
-        return self.images(firmest(name, touch), name=name)
+            return self.images([_still(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
+        return self.images(_still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""

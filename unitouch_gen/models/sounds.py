@@ -16,8 +16,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 from transformers.audio_utils import mel_filter_bank, spectrogram
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
-from unitouch_gen.files import check_file
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_integer, check_number, describe
 
 AudioInput = Any  # a path, samples with their rate, or a list of them
 

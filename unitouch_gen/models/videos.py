@@ -4,7 +4,6 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, first_line, needed
-from unitouch_gen.files import check_file
+from unitouch_gen.errors import InvalidInputError, check_file, first_line, needed
 from unitouch_gen.models.images import ImageInput, load_images
 
-VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})  # suffixes of files
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 LEAST_CHANGE = 2.5 / 255  # of a cell where something touches, of full scale; compression makes 1 to 2 levels of 255
 QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
 
@@ -33,24 +31,21 @@ def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
     return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
 
 
-def firmest(name: str, source: Any) -> Any:
-    """The frame of firmest contact of a video file or an iterator of frames, uint8 (3, H, W); other input as it is.
+def firmest(name: str, source: str | os.PathLike | Iterator[ImageInput]) -> Tensor:
+    """The frame of firmest contact of a video file or an iterator of frames, uint8 (3, H, W).
 
     A recording begins before the contact: the gel at rest is the median of the first frames that are alike.
 
     Args:
         name: Name of the argument, for the messages.
-        source: Path of a video, which takes PyAV (`unitouch_gen[train]`), an iterator of images, or anything else.
+        source: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterator of images.
 
     Raises:
         InvalidInputError, InvalidTypeError: If nothing touches the sensor, a frame is no image or of another size than
             those before, or a video cannot be read.
     """
-    if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in VIDEOS:
-        source = read_video(name, source)
-    if not isinstance(source, Iterator):
-        return source
-    frames, quiet = _frames(name, source), list[Tensor]()
+    frames = _frames(name, source if isinstance(source, Iterator) else read_video(name, source))
+    quiet = list[Tensor]()
     for pixels in frames:
         alike = not quiet or change_of(pixels[None], quiet[0][None]).max() < LEAST_CHANGE
         quiet = [*quiet, pixels] if alike else [pixels]
