@@ -81,8 +81,13 @@ class NoiseSchedule:
         return self.sigma(torch.tensor(timesteps)).tolist()
 
     def karras(self, steps: int, share: float = 1.0) -> list[float]:
-        """Even in sigma^(1/7), so that they lie close near the smallest one (Karras et al., 2022, Equation 5)."""
-        return [self.karras_level(at) for at in torch.linspace(1 - share, 1.0, steps, dtype=torch.float64).tolist()]
+        """Even in sigma^(1/7) (Karras et al., 2022, Equation 5), down to share / steps or `sigma_min`, the larger one.
+
+        The step from there to 0 has an error of about sigma^2 / 2, which is small beside those of few steps.
+        """
+        start = self.karras_level(1.0 - share)
+        end = max(self.sigma_min, min(share / steps, start / 2))
+        return (torch.linspace(start ** (1 / 7), end ** (1 / 7), steps, dtype=torch.float64) ** 7).tolist()
 
     def karras_level(self, share: float) -> float:
         """The noise level at a share of the Karras spacing, from 0 (largest) to 1 (smallest)."""

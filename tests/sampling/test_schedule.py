@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler
+from diffusers import DDIMScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.sampling import Guidance
@@ -22,7 +22,7 @@ def draw(*shape: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_levels_and_timesteps_between_them_are_those_of_diffusers(config):
-    scheduler = DPMSolverMultistepScheduler(**config)
+    scheduler = UniPCMultistepScheduler(**config)
     schedule = NoiseSchedule.of(scheduler)
     levels = ((1 - scheduler.alphas_cumprod) / scheduler.alphas_cumprod) ** 0.5
     torch.testing.assert_close(schedule.sigma(torch.arange(len(levels))), levels.double(), rtol=1e-12, atol=0)
@@ -47,7 +47,8 @@ def test_spacings_are_those_of_diffusers(steps):
     found = schedule.timestep(torch.tensor(schedule.trailing(steps)))
     torch.testing.assert_close(found, trailing.timesteps.double(), rtol=0, atol=1e-6)
     if steps > 1:  # of which diffusers makes a single one at the smallest level
-        karras = DPMSolverMultistepScheduler(**CONFIGS[0], use_karras_sigmas=True)
+        last = max(schedule.sigma_min, 1 / steps)
+        karras = UniPCMultistepScheduler(**CONFIGS[0], use_karras_sigmas=True, sigma_min=last)
         karras.set_timesteps(steps)
         torch.testing.assert_close(torch.tensor(schedule.karras(steps)), karras.sigmas[:-1], rtol=1e-5, atol=0)
     assert schedule.karras(steps)[0] == pytest.approx(schedule.sigma_max)
