@@ -1,6 +1,5 @@
 """Generative pipelines between touch and image."""
 
-from unitouch_gen.pipelines import _pillow  # noqa: F401 - before anything that imports diffusers' pipelines
 from unitouch_gen.pipelines.output import TouchToTextPipelineOutput, UniTouchPipelineOutput
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline

@@ -1,7 +1,4 @@
-"""Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023).
-
-python -m unitouch_gen.training audio --joint runs/image_text/model --output runs/audio
-"""
+"""Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023)."""
 
 import torch
 from torch import Tensor, nn

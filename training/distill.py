@@ -1,7 +1,5 @@
 """A pipeline in four evaluations: distribution matching distillation (Yin et al., 2024, "DMD2") of LoRA layers.
 
-    python -m unitouch_gen.training distill --model my-pipeline --output runs/distill
-
 The student is the network with LoRA layers. It draws as diffusers' `LCMScheduler` does, and learns to draw what guided
 sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers that learn to
 denoise what the student draws, and moved where the network's guided prediction differs from the critic's. The result is
@@ -24,7 +22,8 @@ from transformers import CLIPTextModel
 
 from unitouch_gen.errors import InvalidInputError, check_choice, first_line, needed
 from unitouch_gen.files import class_name, read_settings, reading
-from unitouch_gen.models.autoencoders import read_autoencoder
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.training import touch_ldm, unclip
@@ -118,15 +117,12 @@ class DistillObjective(nn.Module):
     def _denoised(self, z: Tensor, t: Tensor, conditions: dict[str, Tensor]) -> Tensor:
         """What the network predicts of the data, (B, C, h, w)."""
         prediction = predict(self.trained, z, t, **conditions)
-        return to_denoised(prediction, z, self._sigma(t), self.scheduler.config.prediction_type)
+        sigma = self.schedule.sigma(t.cpu()).float().to(t.device)[:, None, None, None]
+        return to_denoised(prediction, z, sigma, self.scheduler.config.prediction_type)
 
     def _noised(self, latents: Tensor, t: Tensor) -> Tensor:
         """The variance-preserving state (B, C, h, w) of latents at timesteps (B,)."""
         return self.scheduler.add_noise(latents, torch.randn_like(latents), t)
-
-    def _sigma(self, t: Tensor) -> Tensor:
-        """Noise levels (B, 1, 1, 1) of timesteps (B,)."""
-        return self.schedule.sigma(t.cpu()).float().to(t.device)[:, None, None, None]
 
 
 def train_layers(unet: UNet2DConditionModel) -> None:
@@ -164,7 +160,7 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, in
 
 
 def conditioned_touches(
-    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
     """The objective that trains a network of touches, and its data."""
     sensors, with_gels = settings["sensors"], unet.config.in_channels != unet.config.out_channels
@@ -173,20 +169,17 @@ def conditioned_touches(
     for source in stage.sources:
         if sensors and (source.sensor is not None or not with_gels):
             check_choice("data: sensor", source.sensor, sensors)
-    with reading("model", stage.folders["model"]):
-        joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["model"] / "vae")
     dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
     how = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
     return touch_ldm.TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, how, gels), dataset
 
 
 def conditioned_pictures(
-    stage: Stage, settings: Arguments, unet: Any, scheduler: Any
+    stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
     """The objective that trains a network of pictures, and its data."""
-    folder = stage.folders["model"]
+    folder, processor = stage.folders["model"], stage.processor
     with reading("model", folder):
-        joint, vae, processor = stage.joint_space("image"), read_autoencoder(folder / "vae"), stage.processor
         normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", use_safetensors=True)
         noising = DDPMScheduler.from_pretrained(folder / "image_noising_scheduler")
         text_encoder = CLIPTextModel.from_pretrained(folder / "text_encoder", use_safetensors=True)
@@ -211,8 +204,9 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     with reading("model", folder):
         unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
+        joint, vae = stage.joint_space("image"), read_autoencoder(folder / "vae")
     add_layers(unet, recipe.lora, recipe.objective.critic_rank, stage.folders.get("init"))
-    conditioned, dataset = conditioned_by(stage, settings, unet, scheduler)
+    conditioned, dataset = conditioned_by(stage, settings, unet, scheduler, joint, vae)
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
     layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=STUDENT)

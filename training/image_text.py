@@ -5,8 +5,6 @@ Pictures of a drawn contact under two lamps can be bound to each other, as SimCL
 
 `--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's and of
 the built-in tokenizer, which knows the world's words and every byte.
-
-python -m unitouch_gen.training image_text --output runs/image_text
 """
 
 import math

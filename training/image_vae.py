@@ -1,7 +1,5 @@
 """Stage 4, the autoencoder of pictures, and the objective that stage 6, of touches, shares.
 
-    python -m unitouch_gen.training image_vae --output runs/image_vae
-
 Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers' own unCLIP pipelines take as well as an
 `AutoencoderKL`, at a fraction of its time, and the paper's `VQModel` (Esser et al., 2021).
 """

@@ -1,8 +1,6 @@
 """Stage 3, touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
 
 At its end it fits the distance that tells which touches are unlike those the encoder was trained on.
-
-python -m unitouch_gen.training touch --joint runs/audio/model --output runs/touch
 """
 
 from collections.abc import Iterable, Sequence

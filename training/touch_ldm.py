@@ -1,8 +1,5 @@
 """Stage 7, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
 
-    python -m unitouch_gen.training touch_ldm --joint runs/image_text/model --vae runs/touch_vae/model \
-        --output runs/touch_ldm
-
 It is trained on image embeddings alone, so text and sound, bound to images, can take their place. The autoencoder and
 the encoder of the condition are frozen: what they say of the training data is computed once.
 

@@ -3,9 +3,6 @@
 The stage `language_model` trains the tiny family's LLaMA from nothing, on what the world can be asked. It is so small,
 and reads so little, that a bridge into one that was trained on words alone hardly moves it. So it is trained with a
 bridge, which is discarded.
-
-python -m unitouch_gen.training language_model --joint runs/image_text/model --output runs/language_model
-python -m unitouch_gen.training touch_llm --joint runs/image_text/model --llama runs/language_model/model
 """
 
 import shutil

@@ -1,7 +1,5 @@
 """Stage 5, pictures from image embeddings: an unCLIP UNet (Ramesh et al., 2022; Rombach et al., 2022).
 
-    python -m unitouch_gen.training unclip --joint runs/image_text/model --vae runs/image_vae/model --output runs/unclip
-
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
 

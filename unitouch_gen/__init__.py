@@ -7,6 +7,7 @@
 Names are imported when they are first used, so that the command line answers quickly.
 """
 
+import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,11 @@ __all__ = [
     "TouchToTextPipelineOutput", "UniTouchConfig", "UniTouchModel", "UniTouchPipelineOutput", "UniTouchProcessor",
     "XToTouchPipeline", "example", "tiny",
 ]  # fmt: skip
+
+# Pictures are prepared with Pillow, so transformers need not tell everyone that torchvision is missing.
+logging.getLogger("transformers.utils.import_utils").addFilter(
+    lambda record: "`CLIPImageProcessor` requires torchvision" not in record.getMessage()
+)
 
 _MODULES = ("errors", "examples", "models", "pipelines.tiny", "pipelines")  # what imports least comes first
 

@@ -59,7 +59,7 @@ BAD = {
         (TO_TOUCH, "No input was given"),
         (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` was given 2 times, another 3"),
         (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
-        ("convert unitouch -o out", "pass `--touch`, `--imagebind` or both"),
+        ("convert unitouch -o out", "Pass `touch`, `imagebind` or both"),
     ],
     "outputs": [
         ("touch-to-image in/dark.png -o in", "`--output` is 'in', where an input would be replaced"),

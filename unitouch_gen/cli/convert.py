@@ -7,7 +7,7 @@ from typer import Option, Typer, echo
 
 from unitouch_gen.cli.loading import folder_of
 from unitouch_gen.cli.options import FILE
-from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.errors import check_dtype
 from unitouch_gen.files import read_settings
 
 app = Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
@@ -29,8 +29,6 @@ def unitouch(
     from unitouch_gen.convert import convert_published
     from unitouch_gen.models import UniTouchConfig
 
-    if touch is None and imagebind is None:
-        raise InvalidInputError("Nothing was given to convert; pass `--touch`, `--imagebind` or both.")
     sizes = None if config is None else UniTouchConfig.from_dict(read_settings("--config", config))
     kind = None if dtype is None else check_dtype("--dtype", dtype)
     lacks = convert_published(output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind)
