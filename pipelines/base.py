@@ -57,7 +57,7 @@ StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tens
 
 MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
-_threads: list[int] = []  # for each running call, how many threads torch had before the first of them
+_threads: list[int] = []  # one entry for each running call: the threads that torch had before any of them
 
 
 def runs_networks(method: Method) -> Method:
@@ -256,7 +256,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
-            warn_of_unknown(reasons, stacklevel=6)  # two methods and `torch.no_grad` above this one
+            warn_of_unknown(reasons, stacklevel=6)  # the line that called the pipeline
         return self._match_norm(features, "touch", throw)
 
     def _match_norm(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
@@ -356,7 +356,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             report.left_out.append("unconditional branch")
         return result
 
-    # In a callback: of the running call. Elsewhere: of the last one.
+    # What diffusers' callbacks read: in a callback, of the running call; otherwise, of the last call.
     _guidance_scale: float
     _num_timesteps: int
     guidance_scale = property(lambda self: self._guidance_scale)

@@ -279,7 +279,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
     def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
-        """(B n, 2 D). One generator: one noise per embedding, as in diffusers. A list: one per image."""
+        """Labels (B n, 2 D). One generator draws noise for each embedding, as in diffusers; a list, for each image."""
         generator, repeats = settings.generator, settings.repeats
         if isinstance(generator, list):
             embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1

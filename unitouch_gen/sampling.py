@@ -72,7 +72,7 @@ class RunReport:
     #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)  #: sensor whose tokens each touch got
-    #: of each touch (of its `background` if given) to that or the nearest sensor; see `SensorBank.distances`
+    #: of each touch, or of its `background`, to that sensor, or to the nearest if it got none's tokens
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)
@@ -135,8 +135,8 @@ def prepare_steps(
     Steps are given by one of three: `num_inference_steps` (default 50); `timesteps` of `scheduler`; or `tolerance`, a
     relative RMS error of the latents from 1e-5 to 1. Without `solver` and `tolerance` a copy of the scheduler runs;
     otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of a tolerance,
-    `eta` of DDIM. `init_strength` is the share of the steps to run (img2img): they begin at that share of the way to
-    noise, in the spacing of the solver or scheduler, whatever their number. Raises `InvalidInputError` or
+    `eta` of DDIM. `init_strength` (img2img) is the share of the steps to run. The first of them is at that share of the
+    spacing of the solver or scheduler, which goes from data (0) to noise (1). Raises `InvalidInputError` or
     `InvalidTypeError` if steps are impossible or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
@@ -207,7 +207,7 @@ def prepare_scheduler(
 
 
 def begun_within(scheduler: Any, share: float) -> Any:
-    """A diffusers scheduler of the noise levels up to a share of its spacing, at the last of which it starts."""
+    """A copy of a diffusers scheduler that starts at a share of its spacing: its higher noise levels are cut off."""
     config, betas = scheduler.config, getattr(scheduler, "betas", None)
     if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
         raise ValueError(f"it starts at noise alone; pass no `init_strength`, which is {share:g}, or name a `solver`")

@@ -1,9 +1,9 @@
 """Data sets: which there are, how a folder is recognised as one of them, and how records are split.
 
-A layout is a module of this folder that has `LOOKS_LIKE`, patterns of what only such a folder holds. Its `read` lists
-the records of a folder, and texts on what a user should know of how it was read; `CLASSES` names those of labels in
-their order, if not all that there are in natural order; `APART` says what keeps splits apart, if not objects or else
-recordings.
+A layout is a module of this folder with `LOOKS_LIKE`, patterns of what only such a folder holds, and `read`, which
+gives the records of a folder, and strings for what a user should know of how it was read. It may have `CLASSES`, names
+of the classes of a label in the order of their numbers, where these are not all that occur, in natural order; and
+`APART`, a `SplitBy`, where splits are not kept apart by objects, or else by recordings.
 """
 
 import os
@@ -161,4 +161,5 @@ def open_dataset(
         return RecordSet(place.name, kind, tuple(records), classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         reason = f"its lists have no {error}" if isinstance(error, KeyError) else first_line(error)
-        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {reason}") from error
+        how = "a folder of one's own, as it looks like no data set that is known" if kind == "folder" else kind
+        raise InvalidInputError(f"`path` is {str(path)!r}, read as {how}: {reason}") from error

@@ -98,7 +98,10 @@ class UniTouchModel(PreTrainedModel):
 
     @apply_forward_hook
     def encode_touches(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> tuple[Tensor, list[str | None]]:
-        """`get_touch_features`, and why each touch is out of distribution: `None` if it is not, or no one can tell."""
+        """`get_touch_features`, and for each touch `UNLIKE` if it is out of distribution, else `None`.
+
+        All are `None` if no distance was fitted.
+        """
         features, patches = self._encode_touches(pixel_values, sensor_ids)
         if "touch" not in self.out_of_distribution:
             return features, [None] * len(pixel_values)
@@ -315,11 +318,11 @@ class Gaussians(nn.Module):
 
 
 class RelativeDistance(nn.Module):
-    """How much farther the `touch_statistics` of touches lie from known ones than from pictures, (B, F) -> (B,).
+    """The relative Mahalanobis distance of `touch_statistics`, (B, F) -> (B,); the larger, the less like a touch.
 
-    The relative Mahalanobis distance: to the nearest class of known touches, less that to pictures in their place (Ren
-    et al., 2021, "A simple fix to Mahalanobis distance for improving near-OOD detection"). Touches of sensors drawn
-    anew lie as far from the known ones as photos do; how much nearer they are to photos tells them apart.
+    It is the distance to the nearest class of known touches, minus that to pictures (Ren et al., 2021, "A simple fix to
+    Mahalanobis distance for improving near-OOD detection"). Touches of sensors drawn anew lie as far from the known
+    touches as photos do, but farther from pictures.
     """
 
     def __init__(self, known: Gaussians, foreign: Gaussians):
@@ -363,7 +366,7 @@ def touch_statistics(patches: Tensor, pixel_values: Tensor) -> Tensor:
 
 
 def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int) -> None:
-    """One warning on the touches that a model abstains from; by the stack level it names the user's line."""
+    """One warning on the touches that a model abstains from; `stacklevel` as of `warnings.warn`."""
     rows = [row for row, reason in enumerate(reasons) if reason]
     named = "; ".join(f"`touch{f'[{row}]' * (len(reasons) > 1)}`: {reasons[row]}" for row in rows[:3])
     more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""

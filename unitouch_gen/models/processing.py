@@ -40,7 +40,7 @@ def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
 
 
 def _still(name: str, touch: Any) -> Any:
-    """A touch, or of a video or an iterator the frame to take."""
+    """The touch itself; of a video or an iterator of frames, the frame of firmest contact."""
     video = isinstance(touch, str | os.PathLike) and str(touch).lower().endswith(VIDEOS)
     return firmest(name, touch) if video or isinstance(touch, Iterator) else touch
 

@@ -70,7 +70,7 @@ def _local_lines(side: int, like: Tensor) -> Tensor:
 
 
 def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
-    """The sums of channels (B, 2, C) with the least curl for their energy, and how far from noise it is, (B, 1, 1, 1).
+    """The sums of channels (B, 2, C) with the least curl for their energy, and a weight (B, 1, 1, 1): 0 for noise.
 
     With gradients a = d/dx and b = d/dy of the channels, sums p and q of them have the curl b.p - a.q. Over all pixels
     its square is a quadratic form of (p, q), as is the energy |a.p|^2 + |b.p|^2 + |a.q|^2 + |b.q|^2: the least ratio

@@ -15,8 +15,8 @@ Sensors = str | Sequence[str | None] | None
 
 @dataclass(frozen=True)
 class SensorMatch:
-    """The sensor whose tokens an image gets, `None` where it is none of the bank's; and the distance to its prototype,
-    see `SensorBank.distances`, `None` if not compared."""
+    """The sensor whose tokens an image gets, `None` for one outside of the bank; and its `SensorBank.distances` from
+    that sensor, or from the nearest, `None` where the bank has no prototype."""
 
     name: str | None
     distance: float | None

@@ -78,7 +78,7 @@ class Residual(nn.Module):
 
 
 def residual_stem(config: Any, side: int) -> list[nn.Module]:
-    """Local contrast, or relief of touches; for each halving a stride-2 convolution and a residual one; a projection.
+    """Local contrast, or relief of touches; then a stride-2 and a residual convolution a halving; then a projection.
 
     Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as
     drawn ones do are then hardly told apart. `side` is the images' shorter one.
@@ -97,7 +97,7 @@ def residual_stem(config: Any, side: int) -> list[nn.Module]:
 
 
 class PatchProjection(nn.Module):
-    """What an embedding reads off the patches, each by a weight of its own, (B, patches, width) -> (B, D).
+    """What patches add to an embedding, each through weights of its place, (B, patches, width) -> (B, D).
 
     A class token of a small transformer learns what is in a view long before it learns where.
     """
@@ -144,7 +144,7 @@ class UniTouchViT(nn.Module):
         return self.embed(self.tokens(pixels, prefix, stemmed))
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Embeddings (B, D) of what leaves the blocks, the prefix with it or without it."""
+        """Embeddings (B, D) of the blocks' output, see `tokens`, which may lack the prefix."""
         embeds = self.projection(self.norm(tokens[:, 0]))
         if self.patch_projection is not None:
             embeds = embeds + self.patch_projection(tokens[:, 1 - self.position.shape[1] :])

@@ -30,7 +30,7 @@ class Sensor:
     azimuths: tuple[float, ...]  # direction of each light around the gel
     elevation: tuple[float, ...]  # angle of each above the gel's plane
     colours: tuple[Colour, ...]  # linear RGB of each
-    falloff: float  # how much nearer pixels get more of a light, relative, [0, 1]
+    falloff: float  # by how much a light is stronger at the rim next to it than in the middle, share, [0, 1]
     gain: float  # brightness change by a facet that turns fully toward a light
     backdrop: tuple[tuple[tuple[float, ...], ...], ...]  # the untouched gel on a coarse grid, (3, h, w) values
     blur: float  # standard deviation of the camera's blur
@@ -40,7 +40,7 @@ class Sensor:
     marker_ink: float = 0.6  # share of the light that a marker takes
     gradients: tuple[tuple[float, float], ...] = ()  # how much more of each light falls on the rim, along x and y
     tint: Colour = (0.0, 0.0, 0.0)  # how much each channel gains for each mm of displacement
-    contact_steps: int = 0  # steps in which the gel comes to lie against a surface; 0 for one that spreads all contact
+    contact_steps: int = 0  # of ADMM, see `gel_displacement`; 0 spreads all of a contact
     gamma: float = 1.0  # power that the camera raises its values to
     dome: float = 0.0  # how far the gel bulges, in its middle over the rim of what the camera sees
 
@@ -62,7 +62,7 @@ def calibrated(name: str, entry: dict[str, Any]) -> Sensor:
 SENSORS: dict[str, Sensor] = {
     name: calibrated(name, entry) for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
 }
-"""By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
+"""The sensors of `calibrated_sensors.json` by name; docs/world.md has a table of them."""
 
 
 def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
