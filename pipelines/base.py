@@ -473,9 +473,10 @@ def check_filled(folder: Path, network: Any) -> None:
                 if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
                     sizes[name] = math.prod(file.get_slice(name).get_shape())
     tensors = [*network.state_dict().values()]
+    lacking = [one for one in tensors if one.is_meta]
     # Tied weights are stored once.
     held, wanted = sum(sizes.values()), sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
-    if held < wanted or any(tensor.is_meta for tensor in tensors):
+    if lacking or held < wanted:
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
             "network."
