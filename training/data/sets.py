@@ -124,7 +124,7 @@ def open_dataset(
         InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
             missing, some of which the message names.
     """
-    kinds = layouts()
+    kinds, how = layouts(), kind
     check_choice("kind", kind, ("auto", *kinds))
     if sensor is not None:
         check_kind("sensor", sensor, str)
@@ -138,6 +138,7 @@ def open_dataset(
         if len(known) > 1:
             raise InvalidInputError(f"`path` is {str(path)!r}, which looks like {' and '.join(known)}; say its `kind`.")
         kind = known[0] if known else "folder"
+        how = kind if known else "a folder of one's own, as it looks like no data set that is known"
     try:
         found = list(kinds[kind].read(place))
         records = [record for record in found if isinstance(record, Record)]
@@ -161,5 +162,4 @@ def open_dataset(
         return RecordSet(place.name, kind, tuple(records), classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         reason = f"its lists have no {error}" if isinstance(error, KeyError) else first_line(error)
-        how = "a folder of one's own, as it looks like no data set that is known" if kind == "folder" else kind
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {how}: {reason}") from error
