@@ -72,7 +72,7 @@ class RunReport:
     #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)  #: sensor whose tokens each touch got
-    #: of each touch, or of its `background`, to that sensor, or to the nearest if it got none's tokens
+    #: of each touch, or of its `background`, to that sensor; to the nearest where it got no tokens
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)

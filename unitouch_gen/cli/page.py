@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +44,10 @@ def tab(pipe: Any, kind: str) -> None:
             fields = FIELDS[kind](pipe) | ({} if asking else solver_fields(pipe))
             button = gradio.Button("Ask" if asking else "Make it", variant="primary")
         with gradio.Column():
-            gallery = partial(gradio.Gallery, label="Pictures", format="png", columns=2, height=600)
             results: list[Any] = [
-                gradio.Textbox(label="Answer") if asking else gallery(),
+                gradio.Textbox(label="Answer")
+                if asking
+                else gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
                 gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
                 gradio.Textbox(label="Run report", lines=3),
                 gradio.Textbox(label="Seed that was used", visible=not asking),
