@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
+from diffusers import (
+    DDIMScheduler,
+    DPMSolverMultistepScheduler,
+    FlowMatchEulerDiscreteScheduler,
+    UniPCMultistepScheduler,
+)
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.sampling import Guidance
@@ -22,7 +27,7 @@ def draw(*shape: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_levels_and_timesteps_between_them_are_those_of_diffusers(config):
-    scheduler = UniPCMultistepScheduler(**config)
+    scheduler = DPMSolverMultistepScheduler(**config)
     schedule = NoiseSchedule.of(scheduler)
     levels = ((1 - scheduler.alphas_cumprod) / scheduler.alphas_cumprod) ** 0.5
     torch.testing.assert_close(schedule.sigma(torch.arange(len(levels))), levels.double(), rtol=1e-12, atol=0)
