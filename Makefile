@@ -22,6 +22,7 @@ TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
 TAKES_audio := $(JOINT)
 TAKES_touch := $(SOUNDED) --init $(RUNS)/touch_pairs/model
 TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
+TAKES_touch_vae := --joint $(RUNS)/touch/model
 TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
 TAKES_language_model := $(JOINT)
 TAKES_touch_llm := $(JOINT) --llama $(RUNS)/language_model/model
@@ -78,6 +79,7 @@ $(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
 $(RUNS)/touch_pairs/record.json: | $(RUNS)/audio/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
+$(RUNS)/touch_vae/record.json: | $(RUNS)/touch/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
 $(RUNS)/touch_llm/record.json: | $(RUNS)/language_model/record.json
 

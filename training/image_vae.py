@@ -5,7 +5,7 @@ Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers'
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ from unitouch_gen.models.autoencoders import (
     read_autoencoder,
     scale_factor,
 )
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.vit import Residual
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.recipe import Arguments, Settings, build
@@ -38,6 +40,7 @@ class AutoencoderLoss(Settings):
     # Deviation of noise on the latents, relative to theirs, so that the decoder forgives a generator its last errors.
     latent_noise: NonNegativeFloat
     latent_weight: NonNegativeFloat  # of the latents' mean square, which keeps them bounded
+    feature_weight: NonNegativeFloat = 0.0  # of `feature_error`, by the touch encoder of the joint space
 
 
 class AutoencoderAugmentation(Settings):
@@ -55,9 +58,9 @@ class AutoencoderRecipe(Recipe):
 class AutoencoderObjective(nn.Module):
     """Reconstruction of pixels from noisy latents, and a VQ model's commitment (van den Oord et al., 2017, Eq. 3)."""
 
-    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss, crop: int | None = None):
+    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss, crop: int | None = None, layers: Any = ()):
         super().__init__()
-        self.trained, self.weights, self.crop = vae, weights, crop
+        self.trained, self.weights, self.crop, self.layers = vae, weights, crop, layers
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
@@ -69,13 +72,24 @@ class AutoencoderObjective(nn.Module):
         noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
         decoded = self.trained.decode(latents + noise)
         restored = decoded.sample.float()
-        error = F.l1_loss(restored, pixels)
         edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
-        loss = error + self.weights.gradient_weight * edges + self.weights.latent_weight * size
+        loss = F.l1_loss(restored, pixels) + self.weights.gradient_weight * edges + self.weights.latent_weight * size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
+        if self.weights.feature_weight:
+            loss = loss + self.weights.feature_weight * feature_error(self.layers, restored, pixels)
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
         return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+
+
+def feature_error(layers: Sequence[nn.Module], images: Tensor, wanted: Tensor) -> Tensor:
+    """L1 error of a stem's features of images in [-1, 1], relative to their deviation (after Johnson et al., 2016)."""
+    a, b, errors = normalise_pixels(images / 2 + 0.5), normalise_pixels(wanted / 2 + 0.5), list[Tensor]()
+    for layer in layers:
+        a, b = layer.to(a.device)(a), layer(b)
+        if isinstance(layer, Residual) or layer is layers[-1]:
+            errors.append(((a - b).abs().mean((0, 2, 3)) / b.std((0, 2, 3)).clamp_min(1e-3)).mean())
+    return torch.stack(errors).mean()
 
 
 def to_signed(pixels: Tensor) -> Tensor:
@@ -92,17 +106,16 @@ def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
 
 
 @torch.no_grad()
-def latents_of(vae: Autoencoder, images: Any) -> Tensor:
-    """Scaled latents (N, C, h, w) of uint8 pixels (N, 3, H, W)."""
-    return in_batches(len(images), lambda rows: encode(vae, to_signed(torch.from_numpy(np.array(images[rows])))))
-
-
 def cached_latents(
     stage: Stage, vae: Autoencoder, name: str, splits: list[Contacts], images: Iterable[np.ndarray]
 ) -> Tensor:
-    """Latents of all arrays of images, which are columns of the splits, by the autoencoder to build on."""
+    """Scaled latents of all arrays of images, which are columns of the splits, by the autoencoder to build on."""
+
+    def latents_of(part: Any) -> Tensor:
+        return in_batches(len(part), lambda rows: encode(vae, to_signed(torch.from_numpy(np.array(part[rows])))))
+
     file = f"{name}-latents-scale{vae.config.scaling_factor:.6g}"
-    return stage.computed_once(file, "vae", splits, lambda: torch.cat([latents_of(vae, part) for part in images]))
+    return stage.computed_once(file, "vae", splits, lambda: torch.cat([latents_of(part) for part in images]))
 
 
 def make_autoencoder(model: Arguments) -> Autoencoder:
@@ -117,10 +130,14 @@ def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
+    if recipe.loss.feature_weight and "joint" not in stage.folders:
+        raise InvalidInputError("`loss.feature_weight` is of features of the touch encoder; only touch_vae takes it.")
+    stem = stage.joint_space("touch").touch_model.stem if recipe.loss.feature_weight else nn.Sequential()
     splits = stage.splits(modality)
     seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
     dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
-    stage.fit(AutoencoderObjective(vae, recipe.loss, crop), dataset)
+    layers = [*stem.requires_grad_(False).eval().children()] or [stem]
+    stage.fit(AutoencoderObjective(vae, recipe.loss, crop, layers), dataset)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)

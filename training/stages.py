@@ -35,7 +35,7 @@ STAGES: dict[str, dict[str, str]] = {
     "touch": {"joint": "audio"},
     "image_vae": {},
     "unclip": {"joint": "image_text", "vae": "image_vae"},
-    "touch_vae": {},
+    "touch_vae": {"joint": "touch"},
     "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
     "language_model": {"joint": "image_text"},
     "touch_llm": {"joint": "image_text", "llama": "language_model"},

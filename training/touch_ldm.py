@@ -64,8 +64,7 @@ class TouchDiffusionObjective(nn.Module):
         settings: TouchDiffusionSettings, backgrounds: Tensor | None = None,
     ):  # fmt: skip
         super().__init__()
-        self.trained = unet
-        self.scheduler, self.embedding_norm, self.settings = scheduler, embedding_norm, settings
+        self.trained, self.scheduler, self.embedding_norm, self.settings = unet, scheduler, embedding_norm, settings
         self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:

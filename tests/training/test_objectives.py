@@ -137,6 +137,19 @@ def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differen
     assert losses["psnr"].item() == pytest.approx(psnr, abs=1e-3)
 
 
+def test_the_error_of_features_is_that_of_a_stem_relative_to_what_it_sees() -> None:
+    layer, deviation = nn.Conv2d(3, 4, 3), torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]  # CLIP's
+    shown, wanted = (to_signed(torch.from_numpy(pictures)) for pictures in (PICTURES[::-1].copy(), PICTURES))
+    with torch.no_grad():
+        apart = F.conv2d((shown - wanted) / 2 / deviation, layer.weight).abs().mean(dim=(0, 2, 3))
+        size = F.conv2d(wanted / 2 / deviation, layer.weight).transpose(0, 1).flatten(1).std(dim=1)  # of what varies
+        for _ in range(2):
+            error = image_vae.feature_error([layer], shown, wanted).item()
+            assert error == pytest.approx((apart / size).mean().item(), rel=1e-2)
+            layer.weight *= 7.0  # a stem that is as much louder
+    assert image_vae.feature_error([layer], wanted, wanted).item() == 0.0
+
+
 def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
     vae, pixels = vq(), to_signed(torch.from_numpy(PICTURES))
     loss = AutoencoderObjective(vae, PLAIN)({"pixels": torch.from_numpy(PICTURES)})["loss"].item()
@@ -155,7 +168,6 @@ def test_latents_are_scaled_to_unit_variance() -> None:
         raw = vae.encode(to_signed(pixels)).latents
     scale = image_vae.latent_scale(vae, ArrayDataset(pixels=PICTURES))
     assert (raw * scale).std().item() == pytest.approx(1.0, abs=1e-3)
-    torch.testing.assert_close(image_vae.latents_of(vae, PICTURES), 0.5 * raw)
 
 
 class Shown(nn.Module):

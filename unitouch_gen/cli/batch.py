@@ -59,7 +59,10 @@ def batch(
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
     most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
-    calls = calls_of([picture for picture in pictures if not picture.file.exists()], most)
+    alike: dict[tuple[str, ...], list[Picture]] = {}  # of the same kinds of inputs
+    for one in (picture for picture in pictures if not picture.file.exists()):
+        alike.setdefault(tuple(one.inputs), []).append(one)
+    calls = [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
     state.wait_for_everyone()  # or the last process would not miss what the first has made
     if device == "auto" and state.num_processes > 1:
         context.params["device"] = str(state.device)
@@ -112,14 +115,6 @@ def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: 
         seed = check_integer("seed", options.value_of(row["seed"]), 0, 2**32)
         pictures.append(Picture(inputs, output / f"{name}.png", seed))
     return pictures
-
-
-def calls_of(pictures: Sequence[Picture], most: int) -> list[list[Picture]]:
-    """Pictures that one call makes: of the same kinds of inputs."""
-    alike: dict[tuple[str, ...], list[Picture]] = {}
-    for one in pictures:
-        alike.setdefault(tuple(one.inputs), []).append(one)
-    return [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
 
 
 def make(pipe: Any, call: list[Picture], settings: dict[str, Any]) -> list[tuple[Any, dict[str, Any]]]:

@@ -41,7 +41,9 @@ def cases(load: Callable[..., Any], kinds: Sequence[str]) -> list[Case]:
     """All cases, with those of some pipelines; `load(kind, dtype=...)` returns one when a case first needs it."""
     kept = cache(lambda kind, dtype: load(kind, dtype=dtype))
     pipelines = [case for kind in kinds for case in pipeline_cases(partial(kept, kind), kind)]
-    return [*stiff_cases(0.01), *pipelines]
+    ways = [(each, partial(adaptive_error, each, 0.01), partial(within, each, 0.01)) for each in PROBLEMS.values()]
+    why = "tolerance, and the step to sigma 0"
+    return [Case(f"{one.name}, tolerance 0.01", run, bound, why) for one, run, bound in ways if one.stiff] + pipelines
 
 
 def error(
@@ -52,13 +54,6 @@ def error(
     if list(codes) != wanted or not bool(found.isfinite().all()):
         return math.inf
     return 0.0 if exact is None else relative_rms(found, exact).max().item()
-
-
-def stiff_cases(tolerance: float) -> Iterator[Case]:
-    """Adaptive steps on problems of which the exact flow is known."""
-    for problem in (each for each in PROBLEMS.values() if each.stiff):
-        run, bound = (partial(one, problem, tolerance) for one in (adaptive_error, within))
-        yield Case(f"{problem.name}, tolerance {tolerance:g}", run, bound, "tolerance, and the step to sigma 0")
 
 
 def adaptive_error(problem: Problem, tolerance: float) -> float:

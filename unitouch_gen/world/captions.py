@@ -47,7 +47,9 @@ def described(draws: Draws, variant: int = 0) -> list[str]:
 def sentence(draws: Draws, row: int, variant: int) -> str:
     """Roughness, hardness and colour, some of them left out, before the material or a noun; then grain and shape."""
     spec = MATERIALS[int(draws.material[row])]
-    chances = iter(_chances(draws.wording[row], variant))
+    a, b = draws.wording[row].double().tolist()
+    a, b = a + 0.618033989 * variant, b + 0.569840291 * variant
+    chances = iter([(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)])
 
     def one(choices: tuple[str, ...] | list[str]) -> str:
         return choices[int(next(chances) * len(choices))]
@@ -72,13 +74,6 @@ def sentence(draws: Draws, row: int, variant: int) -> str:
     if next(chances) < 0.7:
         tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))
     return ", ".join([one(BEGINNINGS) + " ".join([*kept, noun]), *tail])
-
-
-def _chances(seed: Tensor, variant: int) -> list[float]:
-    """Twenty numbers in [0, 1) from a contact's two."""
-    a, b = seed.double().tolist()
-    a, b = a + 0.618033989 * variant, b + 0.569840291 * variant
-    return [(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)]
 
 
 def colour_name(rgb: Tensor) -> str:
