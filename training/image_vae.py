@@ -76,7 +76,7 @@ class AutoencoderObjective(nn.Module):
         loss = F.l1_loss(restored, pixels) + self.weights.gradient_weight * edges + self.weights.latent_weight * size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
-        if self.weights.feature_weight:
+        if self.layers:
             loss = loss + self.weights.feature_weight * feature_error(self.layers, restored, pixels)
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
         return {"loss": loss, "psnr": psnr, "latent": size.detach()}
@@ -130,13 +130,15 @@ def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
-    if recipe.loss.feature_weight and "joint" not in stage.folders:
-        raise InvalidInputError("`loss.feature_weight` is of features of the touch encoder; only touch_vae takes it.")
-    stem = stage.joint_space("touch").touch_model.stem if recipe.loss.feature_weight else nn.Sequential()
+    layers: list[nn.Module] = []
+    if recipe.loss.feature_weight:
+        if "joint" not in stage.folders:
+            raise InvalidInputError("`loss.feature_weight` is of a touch encoder's features; only touch_vae takes it.")
+        stem = stage.joint_space("touch").touch_model.stem.requires_grad_(False)
+        layers = [*stem.children()] or [stem]
     splits = stage.splits(modality)
     seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
     dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
-    layers = [*stem.requires_grad_(False).eval().children()] or [stem]
     stage.fit(AutoencoderObjective(vae, recipe.loss, crop, layers), dataset)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:

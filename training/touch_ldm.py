@@ -9,7 +9,7 @@ named ones.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,25 +102,22 @@ def inputs(
     """
     splits = stage.splits("image", "touch", "sensor")
     embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
-
-    def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
-        return cached_latents(stage, vae, f"{name}{size}", splits, images)
-
-    latents = latents_of("touch", [split.touch for split in splits])
+    latents = cached_latents(stage, vae, f"touch{size}", splits, [split.touch for split in splits])
     sensor = torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors)))
     if not with_gels:
         return ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor), None
     gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in stage.sources)  # type: ignore[union-attr]
     places = torch.from_numpy(np.concatenate(places_of(splits)))
     # Each contact is learnt by its second sensor as well, which has no name.
-    seconds = latents_of("second", [split.second for split in splits if split.second is not None])
+    images = [split.second for split in splits if split.second is not None]
+    seconds = cached_latents(stage, vae, f"second{size}", splits, images)
     dataset = ArrayDataset(
         latents=torch.cat([latents, seconds]),
         image_embeds=torch.cat([embeds, embeds]),
         sensor=torch.cat([sensor, torch.full_like(sensor, len(sensors))]),
         background=torch.cat([places, places + 1]),
     )
-    return dataset, latents_of("untouched", gels)
+    return dataset, cached_latents(stage, vae, f"untouched{size}", splits, gels)
 
 
 def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,6 +170,9 @@ def test_latents_are_scaled_to_unit_variance() -> None:
         raw = vae.encode(to_signed(pixels)).latents
     scale = image_vae.latent_scale(vae, ArrayDataset(pixels=PICTURES))
     assert (raw * scale).std().item() == pytest.approx(1.0, abs=1e-3)
+    stage: Any = SimpleNamespace(computed_once=lambda _name, _option, _splits, make: make())
+    latents = image_vae.cached_latents(stage, vae, "image", [], [PICTURES[:1], PICTURES[1:]])
+    torch.testing.assert_close(latents, 0.5 * raw)
 
 
 class Shown(nn.Module):

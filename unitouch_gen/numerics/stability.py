@@ -41,9 +41,10 @@ def cases(load: Callable[..., Any], kinds: Sequence[str]) -> list[Case]:
     """All cases, with those of some pipelines; `load(kind, dtype=...)` returns one when a case first needs it."""
     kept = cache(lambda kind, dtype: load(kind, dtype=dtype))
     pipelines = [case for kind in kinds for case in pipeline_cases(partial(kept, kind), kind)]
-    ways = [(each, partial(adaptive_error, each, 0.01), partial(within, each, 0.01)) for each in PROBLEMS.values()]
     why = "tolerance, and the step to sigma 0"
-    return [Case(f"{one.name}, tolerance 0.01", run, bound, why) for one, run, bound in ways if one.stiff] + pipelines
+    problems = [problem for problem in PROBLEMS.values() if problem.stiff]
+    stiff = [Case(f"{p.name}, tolerance 0.01", partial(adaptive_error, p), partial(within, p), why) for p in problems]
+    return [*stiff, *pipelines]
 
 
 def error(
@@ -56,14 +57,14 @@ def error(
     return 0.0 if exact is None else relative_rms(found, exact).max().item()
 
 
-def adaptive_error(problem: Problem, tolerance: float) -> float:
+def adaptive_error(problem: Problem, tolerance: float = 0.01) -> float:
     """Relative error of adaptive steps from four noises, of the worst sample."""
     noise = problem.noise(4)
     found, report = problem.run(noise, throw=False, tolerance=tolerance)
     return error(found, report.codes, exact=problem.solution(noise))
 
 
-def within(problem: Problem, tolerance: float) -> float:
+def within(problem: Problem, tolerance: float = 0.01) -> float:
     """A tolerance, and on Gaussian data the error of the step to sigma = 0 along the exact flow."""
     if not problem.is_gaussian:
         return tolerance
