@@ -351,7 +351,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 on_step=on_step if settings.callback else None,
                 progress=lambda share: bar.update(round(share * total) - bar.n),
             )
-        self._guidance_scale, self._num_timesteps = caller._guidance_scale, total  # as diffusers leaves them
+        self._guidance_scale, self._num_timesteps, self._interrupt = caller._guidance_scale, total, caller._interrupt
         if not report.guided:
             report.left_out.append("unconditional branch")
         return result
@@ -359,6 +359,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     # What diffusers' callbacks read: in a callback, of the running call; otherwise, of the last call.
     _guidance_scale: float
     _num_timesteps: int
+    _interrupt: bool
     guidance_scale = property(lambda self: self._guidance_scale)
     do_classifier_free_guidance = property(lambda self: Guidance(self._guidance_scale).active)
     num_timesteps = property(lambda self: self._num_timesteps)
@@ -388,12 +389,12 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
         """Reads a pipeline from a folder or repository, as `DiffusionPipeline.from_pretrained` does.
 
-        Only safetensors are read unless `use_safetensors` says otherwise.
+        Only safetensors are read.
 
         Raises:
             InvalidInputError: If there is no such pipeline, or it cannot be read.
         """
-        name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
+        name, kwargs = "pretrained_model_name_or_path", {**kwargs, "use_safetensors": True}
         key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
         kwargs.setdefault(key, torch.float32)
         if not isinstance(kwargs[key], dict):  # dict: dtypes by component
@@ -417,24 +418,28 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return loaded
 
     def save_pretrained(
-        self, save_directory: str | os.PathLike, *args: Any, card: Card | None = None, **kwargs: Any
-    ) -> None:
+        self, save_directory: str | os.PathLike, safe_serialization: bool = True, *args: Any,
+        card: Card | None = None, **kwargs: Any,
+    ) -> None:  # fmt: skip
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
         Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
         finds our classes, and a model card, README.md. Without `card`, an existing card stays.
 
         Raises:
-            InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
+            InvalidInputError: If LoRA weights are loaded, other files than safetensors are asked for, or the folder
+                cannot be written to; what it held stays.
         """
         check_kind("card", card, Card, type(None))
+        if not safe_serialization:
+            raise InvalidInputError("`safe_serialization` is False, but only safetensors are written; leave it out.")
         folder = as_path("save_directory", save_directory)
         upload, name = kwargs.pop("push_to_hub", False), kwargs.pop("repo_id", folder.resolve().name)
         networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
         if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
             raise InvalidInputError("LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`.")
         with writing_folder("save_directory", folder) as place:
-            super().save_pretrained(place, *args, **kwargs)
+            super().save_pretrained(place, True, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
                 name_classes(place)
             if card is not None or not (folder / CARD).exists():

@@ -1,5 +1,6 @@
 """Reads published weights: a converted joint space and an unCLIP pipeline."""
 
+import copy
 import os
 from typing import Any
 
@@ -19,6 +20,8 @@ def read_joint(
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
     """A converted joint space and its processor; no encoder is read yet."""
     if isinstance(unitouch, UniTouchModel):
+        unitouch = copy.copy(unitouch)  # the caller's keeps its norm and encoders
+        unitouch.config, unitouch._modules = copy.deepcopy(unitouch.config), {**unitouch._modules}
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
     folder = local_folder("unitouch", unitouch, **hub)
     dtype = check_dtype("dtype", dtype)

@@ -22,6 +22,7 @@ from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
+    check_dtype,
     check_integer,
     check_kind,
     check_number,
@@ -215,14 +216,23 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> Any:  # fmt: skip
         """Generates pictures from un-noised embeddings (B, D); see `_check_prompts` and `_denoise`."""
         # 1. Encode the prompts
+        scale = (settings.cross_attention_kwargs or {}).get("scale", 1.0)
         with report.stage("prompt"):
-            hidden_states = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts])
+            states = [one if isinstance(one, Tensor) else self.encode_prompt(one, scale) for one in prompts]
+            states = [one.to(settings.device).expand(len(embeds), -1, -1) for one in states]
+            hidden_states = torch.cat(states).repeat_interleave(settings.repeats, dim=0)
         if all(isinstance(prompt, Tensor) for prompt in prompts):
             report.left_out.append("prompt encoder")
 
         # 2. Noise the embedding before latents are drawn, as diffusers does
         embeds = embeds.to(settings.device, torch.float32)  # the noise must not depend on the dtype
-        labels = self._class_labels(embeds, noise_level, settings)
+        generator, repeats = settings.generator, settings.repeats
+        if isinstance(generator, list):  # which draws noise for each image; a single one, for each embedding
+            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
+        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
+        level = torch.full((len(embeds),), noise_level, device=embeds.device)
+        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
+        labels = labels.repeat_interleave(repeats, dim=0)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
@@ -271,23 +281,6 @@ class TouchToImagePipeline(UniTouchPipeline):
                 unscale_lora_layers(self.text_encoder, lora_scale)
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
-    def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: CallSettings) -> Tensor:
-        """Hidden states of one branch, (B n, T, C)."""
-        if not isinstance(prompt, Tensor):
-            prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale", 1.0))
-        prompt = prompt.to(settings.device)
-        return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
-
-    def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
-        """Labels (B n, 2 D). One generator draws noise for each embedding, as in diffusers; a list, for each image."""
-        generator, repeats = settings.generator, settings.repeats
-        if isinstance(generator, list):
-            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
-        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
-        level = torch.full((len(embeds),), noise_level, device=embeds.device)
-        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
-        return labels.repeat_interleave(repeats, dim=0)
-
     # Checks -----------------------------------------------------------------------------------------------------------
 
     def _check_noise_level(self, noise_level: int | None) -> int:
@@ -332,15 +325,16 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Args:
             pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
-            kwargs: Components and defaults to replace; a missing `processor` is made for `unitouch`.
+            kwargs: Components and defaults to replace, and `torch_dtype` of the networks, which are shared; a missing
+                `processor` is made for `unitouch`.
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
-        modules, settings = cls._get_signature_keys(cls)
+        (modules, settings), dtype = cls._get_signature_keys(cls), kwargs.pop("torch_dtype", None)
         available = {**pipeline.config, **pipeline.components}
         parts = {name: available[name] for name in (*modules, *settings) if name in available} | kwargs
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
-        return cls(**parts)
+        return cls(**parts) if dtype is None else cls(**parts).to(check_dtype("torch_dtype", dtype))
 
     def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
         """diffusers' own unCLIP pipeline of the same components, with the joint space's image encoder.

@@ -24,7 +24,6 @@ from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import (
-    CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
@@ -68,7 +67,6 @@ class XToTouchPipeline(UniTouchPipeline):
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _example_call = 'pipe(image=example("brick", "image"))'
     _hidden_states_name = "condition_embeds"
-    _lora_loadable_modules = ["unet"]
 
     def __init__(
         self, unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers,
@@ -211,7 +209,13 @@ class XToTouchPipeline(UniTouchPipeline):
         embeds = embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
         hidden_states = embeds.repeat_interleave(settings.repeats, dim=0)
         labels = torch.tensor(sensor_labels).repeat_interleave(settings.repeats) if self.config.sensors else None
-        extra_channels = self._background_latents(gels, labels, settings) if self.takes_background else None
+        extra_channels = None
+        if gels:
+            latents_of_gels = self._encode_pictures("background", gels, settings)
+            extra_channels = latents_of_gels.repeat_interleave(settings.shape[0] // len(gels), dim=0)
+        elif self.takes_background:  # those stored with the checkpoint
+            stored = self.backgrounds.latents.float()[labels].to(settings.device)
+            extra_channels = F.interpolate(stored, settings.shape[-2:], mode="bilinear")
         if settings.guidance.active:  # the unconditional token is zeros
             hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])
             labels = None if labels is None else torch.cat([labels, labels])
@@ -221,15 +225,6 @@ class XToTouchPipeline(UniTouchPipeline):
         images = self._images(settings, result, report)
         self.maybe_free_model_hooks()
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
-
-    def _background_latents(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
-        """Latents (B n, C, h, w) of untouched gels: of the given images, or those stored with the checkpoint."""
-        if gels:
-            latents = self._encode_pictures("background", gels, settings)
-            each = settings.shape[0] // len(gels)
-            return latents.repeat_interleave(each, dim=0)
-        latents = self.backgrounds.latents.float()[labels].to(settings.device)
-        return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
     # Checks -----------------------------------------------------------------------------------------------------------
 

@@ -69,3 +69,14 @@ def test_a_bank_bridges_as_it_is_configured_and_as_it_was_saved(tmp_path: Path):
     torch.testing.assert_close(held.bridge(EMBEDS), bridge_nearest(EMBEDS, BANK, 3, 0.2, 0.7))
     held.save_pretrained(tmp_path)
     assert torch.equal(EmbeddingBank.from_pretrained(tmp_path).bridge(EMBEDS), held.bridge(EMBEDS))
+
+
+def test_an_upload_is_as_private_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    asked = {}
+
+    def push(self, repo_id, private=None, token=None, commit_message=None):
+        asked.update(repo_id=repo_id, private=private, token=token, commit_message=commit_message)
+
+    monkeypatch.setattr(EmbeddingBank, "push_to_hub", push)
+    EmbeddingBank.of(BANK).save_pretrained(tmp_path, push_to_hub=True, repo_id="me/bank", private=True, token="secret")
+    assert asked == {"repo_id": "me/bank", "private": True, "token": "secret", "commit_message": None}

@@ -92,6 +92,8 @@ class Stage:
                 f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
                 "`--resume` to go on with it, remove it, or name another output."
             )
+        if resume and recipe is not None:
+            raise InvalidInputError("`recipe` is the checkpoint's with `--resume`; leave it out. `--set` changes it.")
         changes = overrides or ()
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)

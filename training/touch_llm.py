@@ -65,7 +65,7 @@ class AnswerObjective(nn.Module):
         longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # what is behind it is padding
         ids, labels = ids[:, :longest], labels[:, :longest]
         embeds = F.normalize(batch["image_embeds"].float(), dim=1)
-        embeds = embeds + self.noise * torch.rand(len(rows), 1) * F.normalize(torch.randn_like(embeds), dim=1)
+        embeds = embeds + self.noise * torch.rand_like(embeds[:, :1]) * F.normalize(torch.randn_like(embeds), dim=1)
         with self.bridge.attach(self.language_model, embeds):
             return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
 

@@ -101,6 +101,7 @@ class Trainer:
         progress, checkpoint = read_progress(self.output), checkpoints_in(self.output)[-1]
         if progress["step"] > self.steps:
             raise InvalidInputError(f"`steps` is {self.steps}, but {str(checkpoint)!r} is beyond it; ask for more.")
+        own = [{name: group[name] for name in ("betas", "weight_decay")} for group in self.optimizer.param_groups]
         try:
             self.accelerator.load_state(str(checkpoint))
         except (RuntimeError, ValueError, KeyError) as error:
@@ -108,11 +109,13 @@ class Trainer:
             raise InvalidInputError(f"`resume` finds {str(checkpoint)!r}, which {why}") from error
         if self.ema is not None:
             self.ema.to(self.accelerator.device)  # accelerate reads it onto the CPU
+            self.ema.decay = self.config.ema_decay
         self.step, self.seconds = progress["step"], progress["seconds"]
-        # The rate is the configuration's: the one stored may be why the run has to go on with another.
+        # Settings are the configuration's: those stored may be why the run has to go on with others.
         self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * rate_at(self.step, self.config, self.steps)
+        rate = self.config.learning_rate * rate_at(self.step, self.config, self.steps)
+        for group, settings in zip(self.optimizer.param_groups, own, strict=True):
+            group.update(settings, lr=rate)
 
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode."""
@@ -180,7 +183,7 @@ class Trainer:
         if self.main:
             progress = {"step": self.step, "seconds": self.seconds, **self.progress}
             write_file("output", folder / "progress.json", json.dumps(progress))
-            for old in {*folder.parent.iterdir()} - {*checkpoints_in(self.output)[-self.config.keep_checkpoints :]}:
+            for old in {*folder.parent.glob("step*")} - {*checkpoints_in(self.output)[-self.config.keep_checkpoints :]}:
                 (old / "progress.json").unlink(missing_ok=True)
                 shutil.rmtree(old)
         self.accelerator.wait_for_everyone()

@@ -3,6 +3,7 @@
 import csv
 import ctypes
 import functools
+import inspect
 import io
 import json
 import os
@@ -126,7 +127,8 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
         with writing_folder("save_directory", folder) as place:
             save(self, place, *args, **kwargs)
         if push_to_hub:
-            self.push_to_hub(repo_id or folder.resolve().name, token=kwargs.get("token"))
+            given = {name: kwargs[name] for name in kwargs.keys() & inspect.signature(self.push_to_hub).parameters}
+            self.push_to_hub(repo_id or folder.resolve().name, **given)
 
     return save_pretrained
 

@@ -357,9 +357,10 @@ class Run:
         """Calls `on_step` with latents = `scale` * `state`, then zeros samples that are not finite."""
         latents, self.report.steps = state * scale, step + 1
         changed = None if self.on_step is None else self.on_step(step, timestep, latents, self)
-        if changed is not None and changed is not latents:
+        if changed is not None:
             check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
-            state = changed.to(state) / scale
+            if not torch.equal(changed.to(state), state * scale):  # changed in place, too
+                state = changed.to(state) / scale
         state = self.zero_nonfinite(step, state)
         self.latents = state * scale
         return state

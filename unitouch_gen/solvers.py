@@ -147,8 +147,9 @@ def sample_adaptive(
     levels: Levels = [(sigma, denoise(x, sigma))]
     proposed = 0.6 * local_tolerance**0.5  # in log sigma; the error of the first step grows with its square
     while sigma > last:
-        step = limit_step(proposed, math.log(sigma / last))
-        target = max(sigma * math.exp(-step), last)
+        remaining = math.log(sigma / last)
+        step = remaining / 2 if proposed < remaining < 2 * proposed else min(max(proposed, 1e-4), remaining)
+        target = last if step == remaining else sigma * math.exp(-step)
         predicted = exponential_integral(levels[-2:], sigma, target)
         ahead = (target, denoise(target / sigma * x + predicted, target))
         corrected = exponential_integral([*levels[-2:], ahead], sigma, target)
@@ -159,13 +160,6 @@ def sample_adaptive(
             x = after_step(accepted, target / sigma * x + corrected, target)
             sigma, last_error, accepted = target, max(error, 1e-4), accepted + 1
     return after_step(accepted, denoised_at_zero(levels), 0.0)
-
-
-def limit_step(proposed: float, remaining: float) -> float:
-    """The proposed step in log sigma; if at most two are needed to the end, all or half of what remains."""
-    if proposed >= remaining:
-        return remaining
-    return remaining / 2 if 2 * proposed > remaining else max(proposed, 1e-4)
 
 
 def next_step(step: float, error: float, last_error: float, order: int) -> float:

@@ -240,7 +240,7 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     size, figures = joint.processor.image_size, {}
 
     def embedded(pixels: np.ndarray) -> dict[str, np.ndarray]:
-        found = {name: replace(joint, models={"touch": model}).features("touch", pixels).double().numpy()
+        found = {name: replace(joint, model=model).features("touch", pixels).double().numpy()
                  for name, model in spaces.items()}  # fmt: skip
         reliefs = relief(normalise_pixels(float_pixels(pixels))).movedim(1, -1).numpy()
         return found | {"statistics of the relief": statistics([128.0 + 20.0 * one for one in reliefs])}

@@ -44,7 +44,7 @@ BAD = {
     ],
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
-        ("touch-to-image empty -o out", "'empty', where there are no images"),
+        ("touch-to-image empty -o out", "`touch` names no images in 'empty'"),
         ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),

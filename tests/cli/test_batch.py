@@ -93,6 +93,8 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         (here / "table.csv").write_text(table)
         refused(run("table.csv", *words), said)
         assert files(here) == ["in/bright.png", "in/dark.png", "table.csv"]
+    (here / "empty").mkdir()
+    refused(run("empty"), "`source` names no images in 'empty'")
 
 
 @pytest.mark.slow

@@ -69,6 +69,9 @@ def test_a_baseline_is_diffusers_own_scheduler():
         z = scheduler.step(network(z, timestep), timestep, z, return_dict=False)[0]
     row = measure(GAUSSIAN, "diffusers:ddim", 7, repeats=1)
     assert row["error"] == pytest.approx(relative_rms(z, GAUSSIAN.truth).median().item(), rel=1e-5)
+    zero_snr = DDIMScheduler(rescale_betas_zero_snr=True)
+    for name in work_precision.BASELINES:
+        assert work_precision.scheduler_of(name, zero_snr).alphas_cumprod[-1] < 1e-6
 
 
 def test_a_distilled_pipeline_runs_at_its_timesteps_without_guidance():

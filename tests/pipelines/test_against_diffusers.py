@@ -147,6 +147,10 @@ def test_weights_of_each_pipeline_are_scaled_saved_and_loaded(call, tmp_path):
     assert close(call.latents(), plain)
     call.pipe.load_lora_weights(tmp_path)
     assert close(call.latents(), whole)
+    call.pipe.fuse_lora()
+    assert close(call.latents(), whole, 1e-4)
+    call.pipe.unfuse_lora()
+    assert close(call.latents(**NONE), plain, 1e-4)
 
 
 def test_weights_that_do_not_fit_or_are_a_pickle_are_refused(lora, x_to_touch, pipe, tmp_path):

@@ -47,13 +47,15 @@ def test_other_latents_take_the_place_of_the_state(call):
     zeros = lambda pipe, step, timestep, tensors: {"latents": torch.zeros_like(tensors["latents"]).bfloat16()}  # noqa: E731
     found = call.latents(callback_on_step_end=zeros)
     assert found.dtype == torch.float32 and not found.any()
+    in_place = lambda pipe, step, timestep, tensors: {"latents": tensors["latents"].zero_()}  # noqa: E731
+    assert not call.latents(callback_on_step_end=in_place).any()
 
 
 def test_it_may_interrupt_its_own_call(call):
     stop = lambda pipe, step, *_: setattr(pipe, "_interrupt", step == 1)  # noqa: E731
     output = call(num_inference_steps=5, callback_on_step_end=stop, output_type="latent")
     assert output.report.evaluations == 2 and torch.isfinite(output.images).all()
-    assert output.report.codes == [ReturnCode.INTERRUPTED] * 2
+    assert output.report.codes == [ReturnCode.INTERRUPTED] * 2 and call.pipe.interrupt
     assert call(num_inference_steps=3).report.evaluations == 3
 
 

@@ -1,5 +1,6 @@
 """Pipelines on disk and in other hands: saving, loading, variants, dtypes, sharing components, offloading."""
 
+import copy
 import shutil
 from pathlib import Path
 
@@ -113,6 +114,8 @@ def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(t
         file.unlink() if left is None else file.write_bytes(left)
         with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` "):
             load(there)
+        with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` "):
+            load(there, use_safetensors=False)
 
 
 def test_with_lora_loaded_nothing_is_saved_until_it_is_fused_or_unloaded(pipe, touch, tmp_path):
@@ -124,6 +127,8 @@ def test_with_lora_loaded_nothing_is_saved_until_it_is_fused_or_unloaded(pipe, t
     drawn = call.latents()
     with pytest.raises(InvalidInputError, match="LoRA weights are loaded"):
         pipe.save_pretrained(tmp_path)
+    with pytest.raises(InvalidInputError, match="`safe_serialization` is False"):
+        pipe.save_pretrained(tmp_path, safe_serialization=False)  # old safetensors would be read in place of it
     pipe.fuse_lora()
     pipe.unload_lora_weights()
     pipe.save_pretrained(tmp_path)
@@ -173,6 +178,8 @@ def test_components_make_another_pipeline(call):
         made.append(pipe.from_pipe(pipe))
         other = pipe.from_pipe(pipe, unitouch=None, processor=None, default_guidance_scale=4.0)
         assert other.unitouch is None and other.config.default_guidance_scale == 4.0
+        cast = pipe.from_pipe(type(pipe)(**copy.deepcopy(pipe.components)), torch_dtype=torch.bfloat16)
+        assert {cast.unet.dtype, cast.vae.dtype, cast.unitouch.dtype} == {torch.bfloat16}
     for one in made:
         assert all(part is pipe.components[name] for name, part in one.components.items())
         assert torch.equal(Call(quiet(one), call.inputs).latents(), call.latents())

@@ -124,6 +124,14 @@ def test_the_result_is_within_tolerance_for_more_evaluations_the_tighter(name):
     assert evaluations == sorted(evaluations) and evaluations[-1] < 80
 
 
+def test_the_last_step_ends_at_the_last_level_itself():
+    for problem, tolerance in itertools.product([MIXTURE, GAUSSIAN], [0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.015, 0.01]):
+        network, asked = problem.network(2), []
+        noted = lambda z, timestep: asked.append(float(timestep)) or network(z, timestep)  # noqa: E731, B023
+        problem.run(problem.noise(2), tolerance=tolerance, network=noted)
+        assert asked[-1] == 0.0 and all(one != other for one, other in itertools.pairwise(asked))
+
+
 def test_a_network_that_turns_sharply_gets_steps_refused():
     problem = PROBLEMS["gaussian-50-levels"]  # predicts data
     network = problem.network(4)

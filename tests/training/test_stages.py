@@ -174,6 +174,8 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
     given = {"joint": Path(joint), "output": tmp_path, "resume": True}
     found = Stage("touch", TouchRecipe, overrides=["trainer.steps=3"], **given)
     assert (found.recipe.sampler.sigma, found.trainer.steps) == (0.5, 3)
+    with pytest.raises(InvalidInputError, match="`recipe` is the checkpoint's"):
+        Stage("touch", TouchRecipe, recipe="touch_pairs", **given)
     file = next(Path(joint).rglob("*.safetensors"))
     save_file({"weight": torch.ones(2)}, file)
     with pytest.raises(InvalidInputError, match=r"was built on other weights than --joint"):

@@ -136,9 +136,11 @@ def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tm
     make(tmp_path, keep_checkpoints=3)[0].fit()
     assert [folder.name for folder in checkpoints_in(tmp_path)] == [f"step-{step:08d}" for step in (10, 15, 20)]
     (tmp_path / "checkpoints" / "step-00000020" / "progress.json").unlink()  # as if killed while it was written
+    (tmp_path / "checkpoints" / ".DS_Store").touch()
     trainer, _ = make(tmp_path)
     trainer.resume()
     assert trainer.step == 15
+    trainer.fit()
     killed, _ = make(tmp_path, options={"stop_at": 8})
     with pytest.raises(KeyboardInterrupt):
         killed.fit()
@@ -146,10 +148,12 @@ def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tm
     assert not (tmp_path / "log.jsonl").exists()
 
 
-def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
-    make(tmp_path, steps=10)[0].fit()
-    again, _ = make(tmp_path, learning_rate=1e-4)
+def test_other_settings_of_the_optimiser_hold_after_going_on(tmp_path: Path) -> None:
+    make(tmp_path, steps=10, ema_decay=0.9)[0].fit()
+    again, _ = make(tmp_path, learning_rate=1e-4, weight_decay=0.5, beta2=0.9, ema_decay=0.99)
     again.resume()
+    held = [(group["weight_decay"], group["betas"]) for group in again.optimizer.param_groups]
+    assert held == [(0.5, (0.9, 0.9)), (0.0, (0.9, 0.9))] and again.ema.decay == 0.99
     assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, CONFIG, 20))
     again.train_step(data()[again.indices_of(10)])
     assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, CONFIG, 20))

@@ -66,7 +66,7 @@ def touch_llm(
 def distill(
     model: Annotated[str, Option(help="Folder or repository id of a saved pipeline.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
-    recipe: Annotated[str, Option(help="A YAML file, or the name of a recipe of the package.")] = "distill",
+    recipe: Annotated[str | None, Option(help="A YAML file, or the name of a recipe of the package.")] = None,
     overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
     cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,

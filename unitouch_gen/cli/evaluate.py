@@ -46,7 +46,7 @@ def evaluate(
     materials: options.Materials = None,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
-    each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
+    each: Annotated[int, Option(min=2, max=10_000, help="Contacts of each material that images are made of.")] = 4,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False,
 ) -> None:  # fmt: skip

@@ -45,7 +45,7 @@ def stylize(
     context: Context,
     image: Annotated[str, Argument(help="The photo: a file or example:NAME.")],
     touch: options.Touches, output: options.Output,
-    touch_weight: Annotated[float, Option(min=0, max=1, help="Share of the touch; the photo has the rest.")] = 0.7,
+    touch_weight: Annotated[float | None, Option(min=0, max=1, help="Share of the touch, by default 0.7.")] = None,
     layout: Annotated[int, Option(min=2, help="Cells along a side of the grid on which the photo is held.")] = 14,
     keep_colours: Annotated[bool, Option("--keep-colours", metavar="", help="Hold its mean colour, too.")] = False,
     prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,

@@ -62,7 +62,8 @@ def scheduler_of(solver: str, own: Any) -> Any:
     if solver not in BASELINES:
         return own
     kind, settings = BASELINES[solver]
-    return kind(**{name: own.config[name] for name in TRAINED}, **settings)
+    trained = [*TRAINED, *({"rescale_betas_zero_snr"} & own.config.keys())]  # not all schedulers have it
+    return kind(**{name: own.config[name] for name in trained}, **settings)
 
 
 def problem_target(problem: Problem, seeds: int = 8) -> Target:
