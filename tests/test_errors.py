@@ -47,7 +47,7 @@ def test_descriptions_are_short():
 
 
 def test_a_missing_extra_is_named():
-    with pytest.raises(InvalidInputError, match=r"pip install 'unitouch_gen\[train\]'"):
+    with pytest.raises(InvalidInputError, match=r"pip install -c constraints.txt -e '.\[train\]'"):
         errors.needed("no_such_module")
 
 

@@ -118,16 +118,12 @@ def cached_latents(
     return stage.computed_once(file, "vae", splits, lambda: torch.cat([latents_of(part) for part in images]))
 
 
-def make_autoencoder(model: Arguments) -> Autoencoder:
-    """The autoencoder of a recipe's `model`."""
-    kind = autoencoder_class("model.class", model.get("class"))
-    return build("model", kind, {key: value for key, value in model.items() if key != "class"})
-
-
 def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     modality = "touch" if stage.name == "touch_vae" else "image"
     init, crop = stage.folders.get("init"), recipe.augment.crop
-    vae = make_autoencoder(recipe.model) if init is None else read_autoencoder(init).requires_grad_(True)
+    sizes = {**recipe.model}
+    kind = autoencoder_class("model.class", sizes.pop("class", None))
+    vae: Any = build("model", kind, sizes) if init is None else read_autoencoder(init).requires_grad_(True)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
     layers: list[nn.Module] = []

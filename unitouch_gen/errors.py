@@ -89,7 +89,7 @@ def needed(module: str, extra: str = "train") -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise InvalidInputError(f"`{module}` is not installed; run: pip install 'unitouch_gen[{extra}]'") from error
+        raise InvalidInputError(f"`{module}` is missing: pip install -c constraints.txt -e '.[{extra}]'") from error
 
 
 def did_you_mean(value: Any, choices: Iterable[str]) -> str:

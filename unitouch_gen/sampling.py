@@ -165,7 +165,8 @@ def prepare_steps(
     if solver is None:
         return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
     schedule, prediction_type = trained_for(scheduler)
-    solver = check_choice("solver", solver, SOLVERS)
+    if check_choice("solver", solver, SOLVERS) != "ddim":
+        check_unused("solver", eta=eta or None)
     sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
     return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
 

@@ -177,6 +177,30 @@ def cost_table(figures: Figures) -> str:
     return table(["error", *heads], rows, note)
 
 
+SETTINGS = (
+    ("results", "`pipe(...)`, as it is", "default", ""),
+    ("speed", '`tiny("touch-to-image-turbo")`, `tiny("x-to-touch-turbo")`', "turbo", "in four evaluations, "),
+    ("what the paper did", '`solver="ddim", num_inference_steps=50, guidance_scale=9.0`', "ddim", None),
+    ("the exact flow, to an error", "`tolerance=0.05`", None, None),
+)  # fmt: skip
+"""Which setting to take for what: the call, its name among the times, and what its figures' names begin with."""
+
+
+def settings_table(figures: Figures) -> str:
+    """Which setting to take: seconds of a call for one, and the Frechet distance of what it draws, where measured."""
+    made, rows = {"touch-to-image": "touch to picture", "x-to-touch": "photo to touch"}, []
+    for *words, key, beginning in SETTINGS:
+        cells = []
+        for pipeline, name in made.items():
+            seconds = figures["error_and_time"]["turbo"][f"{pipeline}, 1 at once"]["seconds"]
+            told = ["by the tolerance" if key is None else f"{seconds[key]:.2f} s"]
+            if beginning is not None:
+                told.append(f"{figures['quality']['rows'][f'{beginning}{name}: Frechet distance']['value']:.2f}")
+            cells.append(", ".join(told))
+        rows.append([*words, *cells])
+    return table(["for", "take", *(f"{name}: seconds, Frechet distance" for name in made.values())], rows)
+
+
 def turbo_table(figures: Figures) -> str:
     """What is drawn by default and in four evaluations, and how much faster that is than DDIM in 50 steps."""
     quality, rows = figures["quality"]["rows"], []
@@ -191,7 +215,7 @@ def turbo_table(figures: Figures) -> str:
     ]
     note = (
         f"Times as fast, in whole calls, as diffusers' DDIM in 50 steps at guidance 9, and as the default: "
-        f"{'; '.join(times)}. Distances are to real images, smaller is better."
+        f"{'; '.join(times)}. Distances are to real images, smaller is better. Controls are those of four evaluations."
     )
     return table(["figure", "default (spread)", "four evaluations (spread)", *CONTROLS.values()], rows, note)
 
@@ -264,6 +288,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "answers": answers_table,
     "cost at error": cost_table,
     "four evaluations": turbo_table,
+    "settings": settings_table,
 }
 """What stands between two comments of that name, on one page."""
 

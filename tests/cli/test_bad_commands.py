@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 import typer
+from PIL import Image
 
 import unitouch_gen
 from tests.helpers.processes import Child
@@ -45,7 +46,8 @@ BAD = {
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
         ("touch-to-image empty -o out", "`touch` names no images in 'empty'"),
-        ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
+        ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch words.png`"),
+        ("touch-to-image in/dark.png thin.png -o out", "`touch thin.png` is 1 x 1 pixels"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
         ("batch gone -o out", "'gone', which does not exist"),
@@ -53,6 +55,7 @@ BAD = {
     ],
     "models": [
         ("touch-to-image in/dark.png -o out --model gone", "`--model` is 'gone', which is no folder"),
+        ("stylize in/dark.png in/dark.png -o out --model touch-to-image-turbo", "which is no folder"),
         ("app --model in", "`--model` names 'in/model_index.json'"),
     ],
     "combinations": [
@@ -80,6 +83,7 @@ def runs(network: torch.nn.Module, *_: Any, **__: Any) -> None:
 def test_a_bad_command_is_one_line(here, command, models, refused, files, monkeypatch, kind):
     (here / "empty").mkdir()
     (here / "words.png").write_text("no picture")
+    Image.new("RGB", (1, 1)).save("thin.png")
     monkeypatch.setattr(torch.nn.Module, "__call__", runs)
     before = files(here)
     for line, *said in BAD[kind]:

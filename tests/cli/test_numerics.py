@@ -1,6 +1,7 @@
 """`unitouch-gen stability` and `work-precision`: what they run and print, and their exit codes."""
 
 import json
+import re
 import shutil
 
 import pytest
@@ -51,13 +52,14 @@ def test_a_chart_of_error_and_time(here, command, models, target):
         folder = shutil.copytree(models["x-to-touch"], here / "model")
         # Of few levels: a network of random weights changes with every one of them.
         DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2).save_pretrained(folder / "scheduler")
-    points = ["--solvers", "euler,adaptive", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1]
+    points = ["--solvers", "euler,tolerance", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1]
     code, out, err = command("work-precision", *words, *points, "-o", "chart")
     assert code == 0 and "Chart and results are in" in out, err
     rows = json.loads((here / "chart/results.json").read_text())["rows"]
     assert [(row["solver"], row["steps"], row["tolerance"]) for row in rows] == [
-        ("euler", 4, None), ("euler", 8, None), ("adaptive", None, 0.1)]  # fmt: skip
+        ("euler", 4, None), ("euler", 8, None), ("tolerance", None, 0.1)]  # fmt: skip
     assert rows[1]["error"] < rows[0]["error"]
+    assert re.search(r"euler .*4 steps, .*s.*\n", out) and "for an error of" in out
 
 
 def test_bad_input_exits_with_2_and_one_line(here, command, refused, table, files):

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel, VQModel
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
-from unitouch_gen.training.image_vae import make_autoencoder
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
 from unitouch_gen.training.stages import MODULES, Recipe
 
@@ -33,7 +32,8 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
             config = build("model", UniTouchConfig, recipe.model)
             assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 4)  # as the paper's
         elif "vae" in name and "paper" in name:
-            make_autoencoder(recipe.model)
+            sizes = {key: value for key, value in recipe.model.items() if key != "class"}
+            build("model", {"AutoencoderKL": AutoencoderKL, "VQModel": VQModel}[recipe.model["class"]], sizes)
         elif hasattr(recipe, "scheduler"):
             build("model", UNet2DConditionModel, recipe.model)
     if hasattr(recipe, "scheduler"):
@@ -43,7 +43,8 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
 def test_the_papers_networks_have_its_sizes() -> None:
     vae_recipe, recipe, touch = (read_as(f"{name}_paper") for name in ("touch_vae", "touch_ldm", "touch"))
     with torch.device("meta"):
-        vae = make_autoencoder(vae_recipe.model)
+        assert vae_recipe.model.pop("class") == "VQModel"
+        vae = VQModel(**vae_recipe.model)
         latents = vae.encode(torch.empty(1, 3, 256, 256)).latents
         unet = UNet2DConditionModel(**recipe.model, num_class_embeds=3)
         token, sensor = torch.empty(1, 1, 1024), torch.zeros(1, dtype=torch.int64)

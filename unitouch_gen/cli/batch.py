@@ -125,5 +125,5 @@ def make(pipe: Any, call: list[Picture], settings: dict[str, Any]) -> list[tuple
         if len(call) > 1:
             return [made for one in call for made in make(pipe, [one], settings)]
         return [(None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
-    lines = [{**described(one, output.report, row), "seed": one.seed, **settings} for row, one in enumerate(call)]
+    lines = [{**settings, **described(one, output.report, row), "seed": one.seed} for row, one in enumerate(call)]
     return list(zip(output.images, lines, strict=True))

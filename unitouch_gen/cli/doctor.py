@@ -20,7 +20,11 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
     Example: unitouch-gen doctor
     """
     costs = [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else DRAWING)]
-    options.print_table(["package", "installed"], packages())
+    needs = [need for need in requires("unitouch_gen") or [] if not re.search("extra == .(test|lint|docs)", need)]
+    known = {one.name.lower().replace("_", "-"): one.version for one in distributions()}
+    names = dict.fromkeys(re.split(r"[^\w-]", need)[0] for need in needs)
+    packages = [[name, known.get(name.lower().replace("_", "-"), "missing")] for name in names]
+    options.print_table(["package", "installed"], packages)
     echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
     echo(f"Built-in weights: {FAMILY}. Runs on {device_of(device)}")
     options.print_table(["pipeline", "seconds per picture", "weights"], costs)
@@ -39,11 +43,3 @@ def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[s
     parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
     size = sum({id(one): one.nbytes for part in parts for one in part.parameters()}.values())  # some are shared
     return [kind, f"{seconds:.2g} at {report.steps} steps", f"{size / 1e6:.2g} MB"]
-
-
-def packages() -> list[list[str]]:
-    """Names and versions of what the package asks for, that of its extras for users too."""
-    needs = [need for need in requires("unitouch_gen") or [] if not re.search("extra == .(test|lint|docs)", need)]
-    known = {one.name.lower().replace("_", "-"): one.version for one in distributions()}
-    names = dict.fromkeys(re.split(r"[^\w-]", need)[0] for need in needs)
-    return [[name, known.get(name.lower().replace("_", "-"), "missing")] for name in names]

@@ -76,15 +76,15 @@ def load_pipeline(
     import diffusers.utils.logging
     import transformers.utils.logging
 
-    from unitouch_gen.pipelines.tiny import PIPELINES, tiny
+    from unitouch_gen.pipelines.tiny import PIPELINES, TURBO, tiny
 
     diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # what diffusers logs as an error it raises as well
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     take_one_thread(model)
-    if model is None:
-        pipe: Any = tiny(name, dtype=weights_dtype)
+    if model is None or TURBO.get(model) == name:
+        pipe: Any = tiny(model or name, dtype=weights_dtype)
     else:
         folder = folder_of(model)
         with reading("--model", model):

@@ -24,7 +24,7 @@ def work_precision(
     ] = None,
     solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
-    tolerances: Annotated[str, Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
+    tolerances: Annotated[str, Option(help="Tolerances, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
     guidance_scale: Guidance = None,
     seeds: Annotated[int, Option(min=1, max=1000, help="Noises to start from, for each contact.")] = 4,
 ) -> None:
@@ -53,7 +53,7 @@ def work_precision(
     errors = [check_number("--tolerances", value_of(word), 1e-5, 1.0) for word in tolerances.split(",")]
     points: list[dict[str, Any]] = []
     for name in names:
-        kind, values = ("tolerance", errors) if name == "adaptive" else ("steps", counts)
+        kind, values = ("tolerance", errors) if name == "tolerance" else ("steps", counts)
         values = wp.TURBO_STEPS if name == "turbo" else values
         points += [{"solver": check_choice("--solvers", name, known), kind: value} for value in values]
 
@@ -67,15 +67,19 @@ def work_precision(
             with reading("--lora", lora):
                 turbo = distilled(pipe, lora)
         target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale, turbo=turbo)
-        if "default" in names:
+        if "default" in names and target.default_steps not in counts:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up
     rows = [wp.measure(target, **point) for point in tqdm(points, disable=None)]
     wp.save(output, target, rows)
     echo(f"{target.name}, guidance {target.guidance_scale:g}; the reference's own error is {target.own_error:.1e}")
-    best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
-            for row in wp.pareto_front(rows, "evaluations")]  # fmt: skip
-    print_table(["cheapest", "solver", "error", "evaluations", "seconds per sample"], best)
+    reached, table = (0.2, 0.1, 0.05, 0.02, 0.01), list[list[str]]()
+    for name in names:
+        own = sorted((row for row in wp.good(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
+        cells = [f"{wp.amount(row)}, {row['seconds']:.2g} s" for row in own]
+        first = [next((k for k, row in enumerate(own) if row["error"] <= error), None) for error in reached]
+        table.append([name, *("adds noise" if name in target.noisy else "-" if k is None else cells[k] for k in first)])
+    print_table(["for an error of", *(f"{error:.0%}" for error in reached)], table)
     for row in rows:
         if row["failures"]:
             echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")

@@ -39,13 +39,13 @@ Steps = Annotated[int | None, Option("--num-inference-steps", "--steps", min=1, 
 Solver = Annotated[str | None, Option(help="Such as ddim or dpm++2m.")]
 Tolerance = Annotated[float | None, Option(min=1e-5, max=1, help="Relative error of the latents, in place of steps.")]
 Guidance = Annotated[float | None, Option("--guidance-scale", "--guidance", min=0, help="On above 1.")]
-Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: eta=0.5, bridge=false ...")]
+Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: width=160, bridge=false.")]
 Images = Annotated[int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Of each input.")]
 Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 
 # Models and data sets
-Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline; built-in if left out.")]
+Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline, touch-to-image-turbo or such; else built-in.")]
 Dtype = Annotated[str | None, Option(help="float32, float16, bfloat16 or float64; float32 if left out.")]
 Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")]
 Materials = Annotated[str | None, Option(help="Names of its materials by comma, in the order of their numbers.")]

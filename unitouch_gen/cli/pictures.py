@@ -194,9 +194,9 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
     processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
-    for picture in pictures:
+    for picture in pictures:  # an input that cannot be read should not end the work of hours
         for name in read.keys() & picture.inputs.keys():
-            read[name](picture.inputs[name])  # an input that cannot be read should not end the work of hours
+            read[name](one := picture.inputs[name], name=f"{name} {one.name}" if isinstance(one, Path) else name)
     for start in range(0, len(pictures), given["batch_size"]):
         call = pictures[start : start + given["batch_size"]]
         pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(call)} of {len(pictures)}")

@@ -38,7 +38,7 @@ def firmest(name: str, source: str | os.PathLike | Iterator[ImageInput]) -> Tens
 
     Args:
         name: Name of the argument, for the messages.
-        source: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterator of images.
+        source: Path of a video, which takes PyAV (extra `train`), or an iterator of images.
 
     Raises:
         InvalidInputError, InvalidTypeError: If nothing touches the sensor, a frame is no image or of another size than

@@ -40,7 +40,7 @@ BASELINES: dict[str, tuple[type, dict[str, Any]]] = {
 TURBO_STEPS = [1, 2, 4]
 """Their noise levels are among those that `training.distill` learns."""
 
-NAMES = (*SOLVERS, "adaptive", "default", "turbo", *BASELINES)
+NAMES = (*SOLVERS, "tolerance", "default", "turbo", *BASELINES)
 """Solvers that can be measured: "default" is a pipeline's own scheduler, "turbo" a distilled network."""
 
 
@@ -55,6 +55,7 @@ class Target:
     truth: Tensor  # (N, C, h, w) float64
     own_error: float = 0.0  # of the truth, median; 0 for a closed form
     default_steps: int | None = None  # of a pipeline
+    noisy: tuple[str, ...] = ()  # solvers that add noise: they end at other samples, however many steps they take
 
 
 def scheduler_of(solver: str, own: Any) -> Any:
@@ -117,7 +118,8 @@ def pipeline_target(
     most = min(400, pipe.scheduler.config.num_train_timesteps)
     coarse, truth = (run("unipc", steps, throw=True)[0].double() for steps in (most // 2, most))
     own_error = relative_rms(coarse, truth).median().item()
-    return Target(name, run, scale, truth, own_error, pipe.config["default_num_inference_steps"])
+    noisy = ("turbo", "default") if "Ancestral" in type(pipe.scheduler).__name__ else ("turbo",)
+    return Target(name, run, scale, truth, own_error, pipe.config["default_num_inference_steps"], noisy)
 
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor]:
@@ -137,7 +139,7 @@ def measure(
     """One result; what the run raises is its reason."""
     samples = len(target.truth)
     row: Row = {"solver": solver, "steps": steps, "tolerance": tolerance, "samples": samples, "reason": ""}
-    row["default"] = solver == "default" and steps == target.default_steps
+    row |= {"default": solver == "default" and steps == target.default_steps, "noisy": solver in target.noisy}
     try:
         runs = [target.run(solver, steps, tolerance) for _ in range(repeats)]
     except Exception as error:  # the other points are worth having, and this one says what it was
@@ -158,9 +160,9 @@ def good(rows: Sequence[Row]) -> list[Row]:
 
 
 def pareto_front(rows: Sequence[Row], cost: str) -> list[Row]:
-    """The results that no other beats in both error and "seconds" or "evaluations", cheapest first."""
+    """Results without added noise that no other beats in both error and "seconds" or "evaluations", by cost."""
     front: list[Row] = []
-    for row in sorted(good(rows), key=lambda row: (row[cost], row["error"])):
+    for row in sorted((row for row in good(rows) if not row["noisy"]), key=lambda row: (row[cost], row["error"])):
         if not front or row["error"] < front[-1]["error"]:
             front.append(row)
     return front
@@ -197,7 +199,8 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
         known = sorted((row for row in good(rows) if row["solver"] == solver), key=lambda row: row[cost])
         x, low, error, high = ([row[key] for row in known] for key in (cost, "error_low", "error", "error_high"))
         bars, colour = (np.subtract(error, low), np.subtract(high, error)), f"C{NAMES.index(solver)}"
-        axes.errorbar(x, error, yerr=bars, fmt="o-", color=colour, capsize=2, label=solver)
+        label = f"{solver} (adds noise)" if known and known[0]["noisy"] else solver
+        axes.errorbar(x, error, yerr=bars, fmt="o-", color=colour, capsize=2, label=label)
         for row in known:
             if row["default"]:
                 axes.plot(row[cost], row["error"], "*", markersize=19, color=colour)
