@@ -65,7 +65,7 @@ def test_what_pipelines_make_stands_beside_its_controls(rows_of, models, picture
 @pytest.mark.slow
 def test_the_world_gives_all_of_its_tables(rows_of, models, monkeypatch):
     monkeypatch.setattr(heldout, "OBJECTS", 1)
-    words = ("--model", models["x-to-touch"], "--seeds", "1", "--objects", "2", "--each", "1")
+    words = ("--model", models["x-to-touch"], "--seeds", "1", "--objects", "2", "--each", "2")
     found = {name: rows_of(name, *words) for name in ("material", "prompts", "retrieval", "grasp", "x-to-touch")}
     sources = ("picture", "caption", "sound", "touch by another sensor")
     assert {f"{source}: CVTP, in domain" for source in sources} < set(found["x-to-touch"]) and all(found.values())
