@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, help="folder of whole photos, which are restyled")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
+    torch.set_num_threads(1)  # as calls of small pipelines set it, or what is timed beside them would take more
     family, console = json.loads(weights.FIGURES.read_text()), Console(width=110)
     figures = family["figures"]
     for name, measure in PARTS.items():
