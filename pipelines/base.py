@@ -394,6 +394,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         Raises:
             InvalidInputError: If there is no such pipeline, or it cannot be read.
         """
+        if kwargs.get("use_safetensors") is False:
+            raise InvalidInputError("`use_safetensors` is False, but only safetensors are read; leave it out.")
         name, kwargs = "pretrained_model_name_or_path", {**kwargs, "use_safetensors": True}
         key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
         kwargs.setdefault(key, torch.float32)
@@ -427,8 +429,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         finds our classes, and a model card, README.md. Without `card`, an existing card stays.
 
         Raises:
-            InvalidInputError: If LoRA weights are loaded, other files than safetensors are asked for, or the folder
-                cannot be written to; what it held stays.
+            InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
         """
         check_kind("card", card, Card, type(None))
         if not safe_serialization:

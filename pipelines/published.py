@@ -20,8 +20,8 @@ def read_joint(
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
     """A converted joint space and its processor; no encoder is read yet."""
     if isinstance(unitouch, UniTouchModel):
-        unitouch = copy.copy(unitouch)  # the caller's keeps its norm and encoders
-        unitouch.config, unitouch._modules = copy.deepcopy(unitouch.config), {**unitouch._modules}
+        unitouch = copy.copy(unitouch)  # the caller's keeps its norm, encoders, dtype and device
+        unitouch.config, unitouch._modules = copy.deepcopy((unitouch.config, unitouch._modules))
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
     folder = local_folder("unitouch", unitouch, **hub)
     dtype = check_dtype("dtype", dtype)

@@ -325,8 +325,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Args:
             pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
-            kwargs: Components and defaults to replace, and `torch_dtype` of the networks, which are shared; a missing
-                `processor` is made for `unitouch`.
+            kwargs: Components and defaults to replace, and `torch_dtype`; a missing `processor` is made for `unitouch`.
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
         (modules, settings), dtype = cls._get_signature_keys(cls), kwargs.pop("torch_dtype", None)

@@ -113,9 +113,8 @@ class Trainer:
         self.step, self.seconds = progress["step"], progress["seconds"]
         # Settings are the configuration's: those stored may be why the run has to go on with others.
         self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
-        rate = self.config.learning_rate * rate_at(self.step, self.config, self.steps)
         for group, settings in zip(self.optimizer.param_groups, own, strict=True):
-            group.update(settings, lr=rate)
+            group.update(settings, lr=self.config.learning_rate * rate_at(self.step, self.config, self.steps))
 
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode."""

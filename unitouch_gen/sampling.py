@@ -165,8 +165,8 @@ def prepare_steps(
     if solver is None:
         return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
     schedule, prediction_type = trained_for(scheduler)
-    if check_choice("solver", solver, SOLVERS) != "ddim":
-        check_unused("solver", eta=eta or None)
+    if check_choice("solver", solver, SOLVERS) != "ddim" and eta:
+        raise InvalidInputError(f"`eta` is {eta:g}, but {solver!r} adds no noise; pass solver='ddim', or leave it out.")
     sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
     return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
 

@@ -106,7 +106,8 @@ def summary_table(figures: Figures) -> str:
     lines.append(
         "On a real GelSight, hardness, roughness and bumps of objects it has not seen are read linearly off its "
         f"embeddings in {_deviating(real['touch encoder'])}, off those of the same encoder untrained in "
-        f"{_deviating(real['untrained'])}, off plain statistics of the image in {_deviating(real['statistics'])}, off an untouched gel in {_deviating(real['untouched gel'])}; "
+        f"{_deviating(real['untrained'])}, off plain statistics of the image in "
+        f"{_deviating(real['statistics'])}, off an untouched gel in {_deviating(real['untouched gel'])}; "
         f"chance {percent(1 / 3)}."
     )
     head = ["held-out objects, touched by a GelSight", "measured", *CONTROLS.values()]

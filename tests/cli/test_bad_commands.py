@@ -45,7 +45,8 @@ BAD = {
     ],
     "files": [
         ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
-        ("touch-to-image empty -o out", "`touch` names no images in 'empty'"),
+        ("touch-to-image empty -o out", "`touch` is 'empty', where there are no images"),
+        ("touch-to-image 'in/*.jpg' -o out", "`touch` is 'in/*.jpg', where there are no images"),
         ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch words.png`"),
         ("touch-to-image in/dark.png thin.png -o out", "`touch thin.png` is 1 x 1 pixels"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),

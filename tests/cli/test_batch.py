@@ -95,7 +95,7 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         refused(run("table.csv", *words), said)
         assert files(here) == ["in/bright.png", "in/dark.png", "table.csv"]
     (here / "empty").mkdir()
-    refused(run("empty"), "`source` names no images in 'empty'")
+    refused(run("empty"), "`source` is 'empty', where there are no images")
 
 
 @pytest.mark.slow

@@ -64,8 +64,9 @@ def test_photos_are_encoded_by_the_joint_space_or_else_by_the_unclip(parts, phot
     expected = latents(pipe, image=photo, touch=touch)
     theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(parts["other"]).image_encoder.state_dict()
     assert all(torch.equal(theirs[key], value) for key, value in pipe.unitouch.vision_model.state_dict().items())
-    own = UniTouchModel.from_pretrained(parts["alone"])
-    TactileStylizationPipeline.from_published(parts["other"], own)
+    own = UniTouchModel.from_pretrained(parts["alone"], modalities=("touch",))
+    TactileStylizationPipeline.from_published(parts["other"], own).to(torch.bfloat16)
+    assert own.dtype == next(own.touch_model.parameters()).dtype == torch.float32
     assert own.config.embedding_norm != pipe.unitouch.config.embedding_norm  # the caller's stays as it was
     assert own.known_modalities != pipe.unitouch.known_modalities
     pipe.save_pretrained(tmp_path)

@@ -114,7 +114,7 @@ def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(t
         file.unlink() if left is None else file.write_bytes(left)
         with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` "):
             load(there)
-        with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` "):
+        with pytest.raises(InvalidInputError, match="`use_safetensors` is False"):
             load(there, use_safetensors=False)
 
 

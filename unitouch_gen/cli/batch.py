@@ -91,7 +91,7 @@ def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
-    files = files_in("source", folder, paths, columns)
+    files = files_in("source", str(folder), folder, paths, columns)
     places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
     return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
 

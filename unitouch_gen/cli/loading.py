@@ -41,11 +41,11 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
         if word.startswith("example:"):
             files = [example(word.removeprefix("example:"), modality)]
         elif os.path.isdir(word):
-            files = files_in(name, Path(word), Path(word).iterdir(), suffixes_of(modality))
+            files = files_in(name, word, Path(word), Path(word).iterdir(), suffixes_of(modality))
         elif not os.path.lexists(word) and re.search(r"[*?[]", word):
             folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))  # its brackets are a name's
             matches = glob.glob(str(Path(word).relative_to(folder)), root_dir=folder, recursive=True)
-            files = files_in(name, folder, [folder / match for match in matches], suffixes_of(modality))
+            files = files_in(name, word, folder, [folder / one for one in matches], suffixes_of(modality))
         else:
             check_file(name, word, "a sound file" if modality == "audio" else "an image file")
             files = [Path(word)]
@@ -53,13 +53,13 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
     return found
 
 
-def files_in(name: str, folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:
-    """The files with some suffixes among paths in a folder, one at least; says how many files are left out."""
+def files_in(name: str, place: str, folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:
+    """The files with some suffixes among a place's paths in a folder, at least one; says how many are left out."""
     files = [path for path in paths if os.path.isfile(path)]
     kept = [file for file in files if file.suffix.lower() in suffixes and not is_hidden(file.relative_to(folder))]
     if not kept:
-        what = "sounds" if SOUNDS.issuperset(suffixes) else "images"
-        raise InvalidInputError(f"`{name}` names no {what} in {str(folder)!r}; name another folder or pattern.")
+        what = "images" if SOUNDS.isdisjoint(suffixes) else "sounds" if {*suffixes} <= SOUNDS else "inputs"
+        raise InvalidInputError(f"`{name}` is {place!r}, where there are no {what}; name another folder or pattern.")
     if len(kept) < len(files):
         note(f"{len(files) - len(kept)} other files in {folder} are left out.")
     return kept

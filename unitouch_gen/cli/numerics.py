@@ -76,9 +76,9 @@ def work_precision(
     reached, table = (0.2, 0.1, 0.05, 0.02, 0.01), list[list[str]]()
     for name in names:
         own = sorted((row for row in wp.good(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
-        cells = [f"{wp.amount(row)}, {row['seconds']:.2g} s" for row in own]
-        first = [next((k for k, row in enumerate(own) if row["error"] <= error), None) for error in reached]
-        table.append([name, *("adds noise" if name in target.noisy else "-" if k is None else cells[k] for k in first)])
+        enough = [next((row for row in own if row["error"] <= error), None) for error in reached]
+        cells = [f"{wp.amount(row)}, {row['seconds']:.2g} s" if row else "-" for row in enough]
+        table.append([name, *(["adds noise"] * len(reached) if name in target.noisy else cells)])
     print_table(["for an error of", *(f"{error:.0%}" for error in reached)], table)
     for row in rows:
         if row["failures"]:

@@ -45,7 +45,7 @@ Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one 
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 
 # Models and data sets
-Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline, touch-to-image-turbo or such; else built-in.")]
+Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline; built-in if left out.")]
 Dtype = Annotated[str | None, Option(help="float32, float16, bfloat16 or float64; float32 if left out.")]
 Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")]
 Materials = Annotated[str | None, Option(help="Names of its materials by comma, in the order of their numbers.")]

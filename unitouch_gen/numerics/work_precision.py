@@ -7,6 +7,7 @@ import io
 import json
 import math
 import platform
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def pipeline_target(
     most = min(400, pipe.scheduler.config.num_train_timesteps)
     coarse, truth = (run("unipc", steps, throw=True)[0].double() for steps in (most // 2, most))
     own_error = relative_rms(coarse, truth).median().item()
-    noisy = ("turbo", "default") if "Ancestral" in type(pipe.scheduler).__name__ else ("turbo",)
+    noisy = ("turbo", "default") if re.search("Ancestral|LCM|TCD|DDPM|SDE", str(type(pipe.scheduler))) else ("turbo",)
     return Target(name, run, scale, truth, own_error, pipe.config["default_num_inference_steps"], noisy)
 
 
