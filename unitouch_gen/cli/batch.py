@@ -79,11 +79,11 @@ def batch(
                 else:
                     save(image, picture.file)
     failed = gather_object(failed)
+    state.destroy_process_group()  # or now and then a process aborts as it ends
     if state.is_main_process:
         options.note(*failed)
         echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
-    if failed:
-        raise Exit(1)
+    raise Exit(1 if failed else 0)
 
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
