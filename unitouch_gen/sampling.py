@@ -359,9 +359,9 @@ class Run:
         latents, self.report.steps = state * scale, step + 1
         changed = None if self.on_step is None else self.on_step(step, timestep, latents, self)
         if changed is not None:
-            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
-            if not torch.equal(changed.to(state), state * scale):  # changed in place, too
-                state = changed.to(state) / scale
+            changed = check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False).to(state)
+            if not torch.equal(changed, state * scale):  # `latents` itself may have been changed in place
+                state = changed / scale
         state = self.zero_nonfinite(step, state)
         self.latents = state * scale
         return state

@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel, VQModel
+from diffusers import DDPMScheduler, UNet2DConditionModel
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
+from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
 from unitouch_gen.training.stages import MODULES, Recipe
 
@@ -23,6 +24,11 @@ def read_as(name: str, *overrides: str) -> Any:
     return read(main.__annotations__["recipe"], read_recipe(name, overrides))
 
 
+def autoencoder_of(model: dict[str, Any]) -> Any:
+    kind = autoencoder_class("model.class", model["class"])
+    return build("model", kind, {key: value for key, value in model.items() if key != "class"})
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_recipe_is_read_and_built(name: str) -> None:
     recipe = read_as(name)
@@ -32,8 +38,7 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
             config = build("model", UniTouchConfig, recipe.model)
             assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 4)  # as the paper's
         elif "vae" in name and "paper" in name:
-            sizes = {key: value for key, value in recipe.model.items() if key != "class"}
-            build("model", {"AutoencoderKL": AutoencoderKL, "VQModel": VQModel}[recipe.model["class"]], sizes)
+            autoencoder_of(recipe.model)
         elif hasattr(recipe, "scheduler"):
             build("model", UNet2DConditionModel, recipe.model)
     if hasattr(recipe, "scheduler"):
@@ -43,8 +48,7 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
 def test_the_papers_networks_have_its_sizes() -> None:
     vae_recipe, recipe, touch = (read_as(f"{name}_paper") for name in ("touch_vae", "touch_ldm", "touch"))
     with torch.device("meta"):
-        assert vae_recipe.model.pop("class") == "VQModel"
-        vae = VQModel(**vae_recipe.model)
+        vae = autoencoder_of(vae_recipe.model)
         latents = vae.encode(torch.empty(1, 3, 256, 256)).latents
         unet = UNet2DConditionModel(**recipe.model, num_class_embeds=3)
         token, sensor = torch.empty(1, 1, 1024), torch.zeros(1, dtype=torch.int64)
