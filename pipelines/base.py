@@ -41,7 +41,7 @@ from unitouch_gen.errors import (
     check_unused,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, reading, writing_folder
+from unitouch_gen.files import as_path, filling, local_folder, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
@@ -423,7 +423,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self, save_directory: str | os.PathLike, safe_serialization: bool = True, *args: Any,
         card: Card | None = None, **kwargs: Any,
     ) -> None:  # fmt: skip
-        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
+        """Writes the pipeline into a folder, as `DiffusionPipeline.save_pretrained` does; other files there stay.
 
         Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
         finds our classes, and a model card, README.md. Without `card`, an existing card stays.
@@ -439,7 +439,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
         if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
             raise InvalidInputError("LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`.")
-        with writing_folder("save_directory", folder) as place:
+        with filling("save_directory", folder) as place:
             super().save_pretrained(place, True, *args, **kwargs)
             if type(self).__module__.startswith(__package__):
                 name_classes(place)

@@ -14,7 +14,7 @@ from diffusers import DDPMScheduler, DEISMultistepScheduler, EulerAncestralDiscr
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError, run_commands
-from unitouch_gen.files import writing_folder
+from unitouch_gen.files import filling
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.stages import STAGES, weights_of
 from unitouch_gen.training.touch_llm import PROMPT
@@ -78,12 +78,12 @@ def assemble(
     runs: Annotated[Path, typer.Argument(help="Folder of the stages' outputs.")],
     output: Annotated[Path, typer.Argument(help="Folder of the family; what else it holds stays.")],
 ) -> None:
-    """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
+    """Writes a family of what all stages left; nothing of an earlier one is replaced before all of it is written.
 
     Its `family.json` holds the stages' records and no figures: those an earlier one held were of other weights.
     """
     records = read_records(runs)
-    with writing_folder("output", output, replace=True) as place:
+    with filling("output", output) as place:
         for stage, name in PLACES.items():
             shutil.copytree(runs / stage / "model", place / name)
         (place / "x-to-touch" / "embedding_bank").rename(place / "embedding-bank")

@@ -11,12 +11,14 @@ import inspect
 import io
 import json
 import random
+import subprocess
 import sys
 import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,8 @@ from tests.helpers.damage import ODD, WORDS, odd_array, whole_files
 from tests.helpers.processes import Child, command, finished, save_numbered
 from unitouch_gen import cli, example
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, first_line
+from unitouch_gen.files import is_hidden, is_unfinished
+from unitouch_gen.pipelines import TouchToImagePipeline
 
 FOUND: dict[str, list[str]] = {"lost": [], "silent": [], "raw": []}
 DRAW = random.Random()
@@ -68,8 +72,8 @@ def share_pipelines(threads: int, calls: int) -> None:
 
 def seen(folder: Path, pattern: str = "**/*") -> dict[str, bytes]:
     """Files that are not hidden."""
-    files = {str(file.relative_to(folder)): file for file in folder.glob(pattern) if file.is_file()}
-    return {name: file.read_bytes() for name, file in files.items() if not name.startswith(".")}
+    files = {file.relative_to(folder): file for file in folder.glob(pattern) if file.is_file()}
+    return {str(name): file.read_bytes() for name, file in files.items() if not is_hidden(name)}
 
 
 def killed(function: Any, *words: Any, folder: Path, changes: int, seconds: float) -> str:
@@ -83,8 +87,31 @@ def killed(function: Any, *words: Any, folder: Path, changes: int, seconds: floa
     return f"killed at change {at}, {delay} s"
 
 
+@contextmanager
+def what_others_have_there(folder: Path) -> Iterator[None]:
+    """A folder with an empty folder, a link and, where there are rights to, a mount in it, which have to stay."""
+    host = folder.parent / "host"
+    empty = folder / ".git" / "refs"
+    mount = folder / "unet" / "mounted"
+    link = folder / "vae" / "link"
+    for place in (host, empty, mount, link.parent):
+        place.mkdir(parents=True)
+    (host / "precious.txt").write_text("theirs")
+    link.symlink_to(host)
+    mounted = not subprocess.run(["mount", "--bind", host, mount], check=False, capture_output=True).returncode
+    try:
+        yield
+    finally:
+        if mounted:
+            if not (mount / "precious.txt").is_file():
+                note("lost", "a mounted file")
+            subprocess.run(["umount", mount], check=True)
+        if not (empty.is_dir() and link.is_symlink() and (host / "precious.txt").read_text() == "theirs"):
+            note("lost", "an empty folder, a link, or a file behind it")
+
+
 def kill_saves(here: Path, kills: int) -> None:
-    """Of a pipeline that is saved over another one, the old or the new one is there."""
+    """Of a pipeline that is saved over another one, the old or the new one is there, or a folder that is refused."""
     whole, begun, folder = [], time.monotonic(), here / "there"
     for number in (1, 2, 1):
         child = finished(Child(save_numbered, str(folder), number, folder=here))
@@ -92,9 +119,15 @@ def kill_saves(here: Path, kills: int) -> None:
     limits = {"changes": child.changes, "seconds": (time.monotonic() - begun) / 3}
     for count in range(kills):
         how = killed(save_numbered, str(folder), 2 - count % 2, folder=here, **limits)
-        if seen(folder) not in whole:
+        if not is_unfinished(folder) and seen(folder) not in whole:
             note("lost", f"a save, {how}")
-    before, child = seen(folder), Child(save_numbered, str(folder), 2, folder=here, longest=DRAW.choice([0, 60_000]))
+        if is_unfinished(folder) and tried(f"a folder, {how}", lambda: TouchToImagePipeline.from_pretrained(folder)):
+            note("silent", f"a folder that is half of two saves, {how}")
+    finished(Child(save_numbered, str(folder), 1, folder=here))  # which mends it
+    before = seen(folder)
+    if before not in whole:
+        note("lost", "a save over one that was cut off")
+    child = Child(save_numbered, str(folder), 2, folder=here, longest=DRAW.choice([0, 60_000]))
     if child.wait() != 1 or "`save_directory` cannot be written to" not in child.err.splitlines()[-1]:
         note("raw", f"a save to a full disk: {child.err[-300:]}")
     if seen(folder) != before:
@@ -235,7 +268,8 @@ def soak(here: Path) -> None:
         (here / folder).mkdir()
     Image.fromarray(next(recordings.frames())).save(here / "in" / "a.png")
     share_pipelines(threads=6, calls=4)
-    kill_saves(here / "saves", kills=9)
+    with what_others_have_there(here / "saves" / "there"):
+        kill_saves(here / "saves", kills=9)
     kill_batches(here, models["touch-to-image"], kills=9)
     read_damaged_files(here / "damaged", pipes, count=200)
     pass_odd_arguments(pipes, count=150)

@@ -38,8 +38,10 @@ def files(both) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def folder(files, tmp_path_factory) -> Path:
+    """In several shards, as files of the published size are."""
     folder = tmp_path_factory.mktemp("converted")
-    convert_published(folder, **files, config=sizes(), tokenizer=weights.JOINT)
+    convert_published(folder, **files, config=sizes(), tokenizer=weights.JOINT, max_shard_size="100KB")
+    assert len(list(folder.glob("model-*.safetensors"))) > 2
     return folder
 
 

@@ -1,17 +1,17 @@
 """Files and folders are whole or not there, and what cannot be read or written is one error that names the argument."""
 
+import shutil
 import subprocess
-import sys
-import textwrap
-import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
 
+from tests.helpers.processes import Child, finished
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, read_table, reading, replacing, write_file, writing_folder
+from unitouch_gen.files import check_writable, filling, is_unfinished, read_table, reading, replacing, write_file
 
 
 def names(folder: Path) -> set[str]:
@@ -31,10 +31,18 @@ def test_a_write_that_fails_leaves_the_old_file_or_folder_and_nothing_else(tmp_p
     with pytest.raises(RuntimeError), replacing("output", file) as partial:  # noqa: PT012
         partial.write_text("half")
         raise RuntimeError
-    with pytest.raises(RuntimeError), writing_folder("output", tmp_path / "model") as place:  # noqa: PT012
-        write_file("x", place / "a.txt", "half")
-        raise RuntimeError
+    for folder in ("model", "new"):
+        with pytest.raises(RuntimeError), filling("output", tmp_path / folder) as place:  # noqa: PT012
+            write_file("x", place / "a.txt", "half")
+            raise RuntimeError
     assert file.read_text() == "old" and names(tmp_path) == {"model/a.txt"}
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def fill(folder: Path, content: str = "new") -> None:
+    with filling("output", folder) as place:
+        write_file("x", place / "a.txt", content)
+        write_file("x", place / "part" / "b.json", content)
 
 
 def test_a_link_stays_one(tmp_path):
@@ -54,24 +62,86 @@ def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(t
             write("output", tmp_path / place)
 
 
-def test_a_killed_save_leaves_the_old_folder_or_the_new_one(tmp_path):
-    """Two values that are written together are never read apart, wherever the process is killed."""
-    script = textwrap.dedent("""
-        import itertools, sys
-        from pathlib import Path
-        from unitouch_gen.files import writing_folder
-        for number in itertools.count():
-            with writing_folder("x", Path(sys.argv[1])) as place:
-                (place / "a").write_text(str(number)); (place / "b").write_text(str(number))
-            print(flush=True)
-    """)
-    for delay in (0.0, 0.003, 0.011):
-        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "model")], stdout=subprocess.PIPE)
-        process.stdout.readline()
-        time.sleep(delay)
-        process.kill()
-        process.communicate()
-        assert (tmp_path / "model" / "a").read_text() == (tmp_path / "model" / "b").read_text() != ""
+def test_a_folder_that_is_filled_keeps_everything_else(tmp_path, monkeypatch):
+    """The folder itself, its mode, links and empty folders in it, and files of others; also as the working folder."""
+    folder, elsewhere = tmp_path / "model", tmp_path / "elsewhere"
+    write_file("x", folder / "mine.txt", "mine")
+    write_file("x", elsewhere / "a.txt", "theirs")
+    (folder / ".git" / "refs").mkdir(parents=True)
+    (folder / "part").symlink_to(elsewhere)
+    (folder / "a.txt").symlink_to(elsewhere / "a.txt")
+    folder.chmod(0o2770)
+    before = folder.stat()
+    monkeypatch.chdir(folder)
+    fill(Path())
+    assert (folder.stat().st_ino, folder.stat().st_mode) == (before.st_ino, before.st_mode)
+    assert Path.cwd() == folder and (folder / ".git" / "refs").is_dir() and (folder / "part").is_symlink()
+    assert (folder / "mine.txt").read_text() == "mine"
+    # What a link points to is not written through; a folder behind one is the user's way to say where files go.
+    assert (elsewhere / "a.txt").read_text() == "theirs" and (folder / "a.txt").read_text() == "new"
+    assert names(folder) == {"mine.txt", "a.txt"} and names(elsewhere) == {"a.txt", "b.json"}
+
+
+@pytest.fixture
+def mounted(tmp_path):
+    """A folder of the machine that is mounted inside a model's folder, and that folder."""
+    host, inside = tmp_path / "host", tmp_path / "model" / "part"
+    write_file("x", host / "precious.txt", "theirs")
+    inside.mkdir(parents=True)
+    if shutil.which("mount") is None or subprocess.run(["mount", "--bind", host, inside], check=False).returncode:
+        pytest.skip("folders cannot be mounted without rights")
+    yield host, inside
+    subprocess.run(["umount", inside], check=True)
+
+
+def test_a_mounted_folder_keeps_its_files_and_may_be_written_to(mounted):
+    host, inside = mounted
+    fill(inside.parent)
+    assert names(host) == {"precious.txt", "b.json"} and names(inside.parent) == {
+        "a.txt", "part/precious.txt", "part/b.json",
+    }  # fmt: skip
+    fill(inside)  # a mount by itself, which no rename can replace
+    assert (host / "a.txt").read_text() == "new" and (host / "precious.txt").read_text() == "theirs"
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_changes(tmp_path):
+    (tmp_path / "part" / "b.json").mkdir(parents=True)
+    write_file("x", tmp_path / "a.txt", "old")
+    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*b\.json.* Nothing was changed"):
+        fill(tmp_path)
+    assert names(tmp_path) == {"a.txt"} and (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_killed_save_leaves_the_old_files_or_the_new_ones_or_a_folder_that_is_refused(tmp_path):
+    """Wherever the process is killed, files of two saves are never read as one model; the next save mends it."""
+    folder = tmp_path / "model"
+    fill(folder, "old")
+    changes = finished(Child(fill, folder, "old", folder=tmp_path)).changes
+    states = set()
+    for killed_at in range(1, changes + 1):
+        assert Child(fill, folder, "new", folder=tmp_path, killed_at=killed_at).wait() == -9
+        if is_unfinished(folder):
+            states.add("unfinished")
+            with pytest.raises(InvalidInputError, match=r"`model` is .*a save into it is under way or was cut off"):
+                reading("model", folder).__enter__()
+        else:
+            one, other = (folder / "a.txt").read_text(), (folder / "part" / "b.json").read_text()
+            assert one == other
+            states.add(one)
+        fill(folder, "old")
+        assert not is_unfinished(folder) and (folder / "part" / "b.json").read_text() == "old"
+    assert states == {"old", "unfinished", "new"}
+
+
+def test_of_two_saves_at_once_one_is_there(tmp_path):
+    def fill_again(content: str) -> None:
+        for _ in range(20):
+            fill(tmp_path / "model", content)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(fill_again, ("one", "two")))
+    one, other = (tmp_path / "model" / "a.txt").read_text(), (tmp_path / "model" / "part" / "b.json").read_text()
+    assert one == other and names(tmp_path / "model") == {"a.txt", "part/b.json"}
 
 
 def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_stays(tmp_path):

@@ -21,7 +21,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_dtype, check_file, check_finite, check_kind, first_line
-from unitouch_gen.files import as_path, writing_folder
+from unitouch_gen.files import as_path, check_writable, filling
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
@@ -210,9 +210,15 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
 
 
 def convert_published(
-    output: str | os.PathLike, *, touch: str | os.PathLike | None = None, imagebind: str | os.PathLike | None = None,
-    tokenizer: str | os.PathLike | None = None, config: UniTouchConfig | None = None, dtype: torch.dtype | None = None,
-) -> list[str]:  # fmt: skip
+    output: str | os.PathLike,
+    *,
+    touch: str | os.PathLike | None = None,
+    imagebind: str | os.PathLike | None = None,
+    tokenizer: str | os.PathLike | None = None,
+    config: UniTouchConfig | None = None,
+    dtype: torch.dtype | None = None,
+    max_shard_size: str = "2GB",
+) -> list[str]:
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
     Args:
@@ -222,6 +228,7 @@ def convert_published(
         tokenizer: Folder of the tokenizer of text: OpenCLIP's, as in Stable Diffusion 2.1 unCLIP.
         config: Sizes of encoders other than the published ones, without sensors.
         dtype: Precision of the weights; the file's own when left out.
+        max_shard_size: Size of the largest file of weights, which is also what is held in memory at a time.
 
     Returns:
         What the folder lacks, in words.
@@ -238,14 +245,15 @@ def convert_published(
         raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
     wanted = None if dtype is None else check_dtype("dtype", dtype)
     words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
-    model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
+    check_writable("output", output / "config.json")
+    model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.known_modalities else []
     if not words:
         lacks.append("a tokenizer, which `tokenizer` would bring")
-    with writing_folder("output", output) as folder:
-        model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
+    with filling("output", output) as folder:
+        model.save_pretrained(folder, max_shard_size=max_shard_size)
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
     return lacks

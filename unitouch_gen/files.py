@@ -1,7 +1,7 @@
-"""Files and folders: put in place whole by a rename, and read with errors that name the argument."""
+"""Files and folders: written whole, put in place by renames, and read with errors that name the argument."""
 
 import csv
-import ctypes
+import errno
 import functools
 import inspect
 import io
@@ -12,11 +12,16 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
@@ -26,24 +31,25 @@ _LOADING = threading.RLock()  # libraries patch torch in all threads while they 
 
 # Writing --------------------------------------------------------------------------------------------------------------
 
+UNFINISHED = ".unfinished-save"
+"""Lies in a folder while files of a save take their places, and stays there if the save is cut off."""
+
+SHARD_NUMBER = re.compile(r"-\d+-of-\d+(?=\.safetensors$)")
+
 
 @contextmanager
-def _hidden_beside(
-    name: str, target: Path, kind: Callable[[Path], bool] = os.path.isfile, folder: Path | None = None
-) -> Iterator[Path]:
-    """A hidden folder beside a target, or in `folder`; errors of writing name the argument that named the target."""
-    folder = folder or target.parent
+def _writing_to(name: str, target: Path) -> Iterator[None]:
+    """Turns errors of writing into one that names the argument."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.path.exists(target) and not kind(target):
-            raise FileExistsError(17, "something of another kind is there")
-        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=folder) as hidden:
-            yield Path(hidden)
-    except Exception as error:  # libraries in Rust have no class of their own
-        if isinstance(error, InvalidInputError) or not (isinstance(error, OSError) or "(os error" in str(error)):
+        yield
+    except Exception as error:
+        is_os_error = isinstance(error, OSError) or "(os error" in str(error)  # the second of libraries in Rust
+        if isinstance(error, InvalidInputError) or not is_os_error:
             raise
-        why = f"{getattr(error, 'strerror', None) or first_line(error)}. Nothing was changed."
-        raise InvalidInputError(f"`{name}` cannot be written to {str(target)!r}: {why}") from error
+        why = getattr(error, "strerror", None) or first_line(error)
+        raise InvalidInputError(
+            f"`{name}` cannot be written to {str(target)!r}: {why}. Nothing was changed."
+        ) from error
 
 
 @contextmanager
@@ -53,9 +59,13 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
     Raises `InvalidInputError` if it cannot be written, or is a folder or a device; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    with _hidden_beside(name, target) as hidden:
-        yield hidden / file.name
-        os.replace(hidden / file.name, target)
+    with _writing_to(name, target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _check_replaceable(target)
+        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
+            partial = Path(hidden) / file.name
+            yield partial
+            os.replace(partial, target)
 
 
 def write_file(name: str, file: Path, content: str | bytes) -> Path:
@@ -68,63 +78,143 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
 def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    above = next(parent for parent in target.parents if os.path.exists(parent))  # unlike Path.exists, of any length
-    with _hidden_beside(name, target, folder=above):
-        pass
+    with _writing_to(name, target):
+        _check_replaceable(target)
+        # os.path.exists is False for a name that is too long, where Path.exists raises.
+        above = next(parent for parent in target.parents if os.path.exists(parent))
+        tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above).cleanup()
+
+
+def _check_replaceable(file: Path) -> None:
+    """Raises `FileExistsError` where there is something other than a file."""
+    if os.path.exists(file) and not os.path.isfile(file):
+        raise FileExistsError(errno.EEXIST, f"{file.name} is there and is not a file")
 
 
 @contextmanager
-def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterator[Path]:
-    """An empty folder of the same name to write to, which takes another one's place when the block ends.
+def filling(name: str, folder: Path) -> Iterator[Path]:
+    """An empty folder to write to, whose files take their places in `folder` when the block ends without an error.
 
-    Files of the old folder that the new one lacks are kept, but for weights that a reader could take for the new ones,
-    and with `replace` those in folders that the new one has. A process that is killed leaves the old folder or the new
-    one. Raises `InvalidInputError` if it cannot be written; what was there stays.
+    Everything else in `folder` stays as it is, but for older weights of the components that were written (another
+    number of shards). Files take their places one by one, weights first and configs last. While they do, and if that is
+    cut off, `UNFINISHED` lies in `folder`, and `reading` refuses it.
+
+    Raises:
+        InvalidInputError: If `folder` cannot be written to; what was there stays.
     """
     target = Path(os.path.realpath(folder))
-    with _hidden_beside(name, target, os.path.isdir) as hidden:
-        new = hidden / target.name
-        new.mkdir()
-        yield new
-        if not target.exists():
-            os.rename(new, target)
-            return
-        written = {entry.name for entry in new.iterdir()} if replace else set()
-        for file in filter(os.path.isfile, sorted(target.rglob("*"))):
-            part = file.relative_to(target)
-            place = new / part
-            if not (place.exists() or part.parts[0] in written or _superseded(place)):
-                place.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    os.link(file, place)
-                except OSError:  # of file systems without links
-                    shutil.copy2(file, place)
-        _exchange(new, target)  # the old folder goes with the hidden one
+    with _writing_to(name, target):
+        is_new = not os.path.exists(target)
+        target.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
+        try:
+            yield staging
+            moves = _move_beside(staging, target)
+        except BaseException:
+            shutil.rmtree(staging, ignore_errors=True)
+            if is_new:
+                with suppress(OSError):  # of a folder that somebody else has filled meanwhile
+                    target.rmdir()
+            raise
+    try:
+        with _locked(target):
+            _put_in_place(moves, target)
+    except OSError as error:
+        why = f"{error.strerror}. Files that are not in place yet lie beside it, as {staging.name}. Save again."
+        raise InvalidInputError(f"`{name}` was written in part to {str(target)!r}: {why}") from error
+    shutil.rmtree(staging, ignore_errors=True)
 
 
-def _superseded(file: Path) -> bool:
-    """Whether it names weights of which its folder holds others: shards and a single file, of the same variant."""
-    variant = functools.partial(re.sub, r"-\d+-of-\d+|\.index|\.json", "")
-    others = file.parent.glob("*.safetensors*")
-    return ".safetensors" in file.name and variant(file.name) in [variant(other.name) for other in others]
+def _move_beside(staging: Path, target: Path) -> dict[Path, Path]:
+    """Moves staged files beside their destinations, under hidden names; returns destinations by those.
+
+    Only a move within one folder is sure to be a rename: folders inside `target` may be mounts or links.
+    """
+    moves: dict[Path, Path] = {}
+    try:
+        for staged in files_below(staging):
+            destination = target / staged.relative_to(staging)
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            _check_replaceable(destination)
+            beside = destination.with_name(f".{destination.name}{staging.name}")
+            moves[beside] = destination
+            shutil.move(staged, beside)
+    except BaseException:
+        for beside in moves:
+            beside.unlink(missing_ok=True)
+        raise
+    return moves
 
 
-def _exchange(one: Path, other: Path) -> None:
-    """Exchanges two folders in one step where the system can (Linux: renameat2), and in two renames elsewhere."""
-    library, here, exchange = ctypes.CDLL(None), -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    places = os.fsencode(one), os.fsencode(other)
-    if not hasattr(library, "renameat2") or library.renameat2(here, places[0], here, places[1], exchange):
-        os.rename(other, one.with_name(f"{one.name}.old"))
-        os.rename(one, other)
+def _put_in_place(moves: dict[Path, Path], target: Path) -> None:
+    """Renames files to their destinations, then removes what earlier saves left of the same weights."""
+    earlier = _earlier_weights([*moves.values()])
+    folders = sorted({target, *(destination.parent for destination in moves.values())})
+    for folder in folders:
+        (folder / UNFINISHED).touch()
+    for beside, destination in sorted(moves.items(), key=lambda move: _order(move[1])):
+        os.replace(beside, destination)
+    for file in earlier:
+        file.unlink(missing_ok=True)
+    for folder in reversed(folders):
+        (folder / UNFINISHED).unlink(missing_ok=True)
+
+
+def _order(destination: Path) -> tuple[bool, int, Path]:
+    """A key to sort files by: weights before what describes them, and what lies deeper before what names it."""
+    return destination.suffix == ".json", -len(destination.parts), destination
+
+
+def _earlier_weights(written: Sequence[Path]) -> set[Path]:
+    """Weights of the same components and variants under other names: a single file, or an index and its shards."""
+    earlier = set[Path]()
+    for file in written:
+        if file.suffix != ".safetensors":
+            continue
+        single = SHARD_NUMBER.sub("", file.name)  # model.fp16-00001-of-00002.safetensors: model.fp16.safetensors
+        component, *variant = single.removesuffix(".safetensors").split(".", 1)
+        index = file.with_name(".".join([component, "safetensors", "index", *variant, "json"]))
+        shards = [shard for shard in _shards_in(index) if SHARD_NUMBER.sub("", shard) == single]
+        earlier |= {index, *(file.with_name(name) for name in (single, *shards))}
+    return earlier - {*written}
+
+
+def _shards_in(index: Path) -> set[str]:
+    """Names of the files that an index of sharded weights lists; none where there is no such index."""
+    try:
+        return set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return set()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Holds a lock on a folder, so that the files of two saves do not mix; without one where the system has none."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # of file systems without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a save into a folder is under way or was cut off."""
+    return os.path.exists(folder / UNFINISHED)
 
 
 def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
-    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`; uploads come after that."""
+    """A `save_pretrained` whose files take their places when all of them are written; uploads come after that."""
 
     @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
     def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
-        folder, repo_id = as_path("save_directory", save_directory), kwargs.pop("repo_id", None)
-        with writing_folder("save_directory", folder) as place:
+        folder = as_path("save_directory", save_directory)
+        repo_id = kwargs.pop("repo_id", None)
+        with filling("save_directory", folder) as place:
             save(self, place, *args, **kwargs)
         if push_to_hub:
             given = {name: kwargs[name] for name in kwargs.keys() & inspect.signature(self.push_to_hub).parameters}
@@ -242,6 +332,8 @@ def reading(name: str, place: Any) -> Iterator[None]:
     folder = as_path(name, place)
     with _LOADING, torch.inference_mode(False):  # inference tensors can never be trained
         try:
+            if is_unfinished(folder):
+                raise InvalidInputError("a save into it is under way or was cut off. Save again.")
             for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
                 read_settings(name, file)  # libraries name no file, and would wait for a pipe
             yield

@@ -1,6 +1,7 @@
 """The joint model: features against transformers' own encoders, tokens by sensor, and encoders read when first used."""
 
 import json
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,7 +15,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 
 from tests.helpers.damage import SETTINGS, WEIGHTS
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
+from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 
 pytestmark = pytest.mark.usefixtures("without_gradients")
@@ -104,6 +105,30 @@ def test_saving_over_its_own_folder_and_elsewhere_keeps_every_tensor(folder, tmp
         model.save_pretrained(place)
         after = load_file(place / "model.safetensors")
         assert before.keys() == after.keys() and all(torch.equal(before[key], after[key]) for key in before)
+
+
+def test_other_parts_are_saved_beside_shards_and_shards_give_way_to_other_shards(
+    model: UniTouchModel, tokenizer, tmp_path: Path
+) -> None:
+    """A processor beside a sharded model; then the model in one file, in fewer shards, and as a variant of either."""
+    (tmp_path / "controlnet.safetensors").write_text("theirs")
+    for variant, size in ((None, "20KB"), (None, "10GB"), ("fp16", "20KB"), (None, "40KB"), ("fp16", "10GB")):
+        model.save_pretrained(tmp_path, max_shard_size=size, variant=variant)
+        UniTouchProcessor.for_config(model.config, tokenizer).save_pretrained(tmp_path)
+        assert equal_states(UniTouchModel.from_pretrained(tmp_path, variant=variant, modalities=MODALITIES), model)
+    assert equal_states(UniTouchModel.from_pretrained(tmp_path, modalities=MODALITIES), model)
+    assert UniTouchProcessor.from_pretrained(tmp_path).tokenizer.get_vocab() == tokenizer.get_vocab()
+    weights = {file.name for file in tmp_path.glob("*.safetensors*")}
+    shards = {name for name in weights if re.fullmatch(r"model-\d+-of-\d+\.safetensors", name)}
+    assert len(shards) > 1 and len({name.rpartition("-")[2] for name in shards}) == 1
+    others = {"controlnet.safetensors", "model.fp16.safetensors", "model.safetensors.index.json"}
+    assert weights - shards == others
+
+
+def equal_states(one: UniTouchModel, other: UniTouchModel) -> bool:
+    wanted = other.state_dict()
+    state = one.state_dict()
+    return state.keys() == wanted.keys() and all(torch.equal(state[key], value) for key, value in wanted.items())
 
 
 def test_a_model_of_some_modalities_is_saved_with_those(config: UniTouchConfig, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm.contrib.concurrent import thread_map
 
 from unitouch_gen.errors import first_line
-from unitouch_gen.files import replacing, writing_folder
+from unitouch_gen.files import filling, is_unfinished, replacing
 from unitouch_gen.training.data.sets import RecordSet
 
 
@@ -35,12 +35,13 @@ Arrays = dict[str, np.memmap]
 def mapped(
     folder: Path, count: int, columns: Mapping[str, tuple[Any, ...]], write: Callable[[Arrays, Path], None]
 ) -> Arrays:
-    """Arrays of `count` rows in the .npy files of a folder; `write` fills them where there is no such folder yet.
+    """Arrays of `count` rows in the .npy files of a folder; `write` fills them where they are not there yet.
 
     `columns` gives dtype and shape of a row by name. What `write` puts beside the arrays is kept with them.
     """
-    if not folder.is_dir():
-        with writing_folder("cache", folder) as place:
+    there = all((folder / f"{name}.npy").is_file() for name in columns)
+    if not there or is_unfinished(folder):
+        with filling("cache", folder) as place:
             arrays: Arrays = {}
             for name, (dtype, *shape) in columns.items():
                 file = place / f"{name}.npy"

@@ -272,7 +272,7 @@ class UniTouchModel(PreTrainedModel):
 
     @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, *, variant: str | None = None, **kwargs: Any) -> None:
-        """Writes config and weights, all or none; encoders still on disk are read first and written, too."""
+        """Writes config and weights; encoders that are still on disk are read first and written, too."""
         for modality in self.known_modalities:
             self.load(modality)
         super().save_pretrained(save_directory, variant=variant, **kwargs)
