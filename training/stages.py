@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from datetime import timedelta
 from functools import cached_property, partial
 from importlib import import_module
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -22,12 +23,13 @@ from typer import Option
 from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import image_embeddings
-from unitouch_gen.files import check_writable, writing_folder
+from unitouch_gen.files import check_writable, files_below, filling
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
+from unitouch_gen.training.checkpoints import checkpoints_in, read_progress
 from unitouch_gen.training.data import Contacts, DataConfig, DrawnContacts, columns_of, computed_once
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
+from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 STAGES: dict[str, dict[str, str]] = {
     "image_text": {},
@@ -114,8 +116,19 @@ class Stage:
                 "now; name those, or begin anew."
             )
         self.sources = self.data.sources()
-        for option, folder in {"output": self.output, "cache": self.cache}.items():
-            check_writable(option, folder / "record.json")
+        self.sets = [source.summary for source in self.sources]
+        self.earlier_sets = before.get("earlier_sets", [])  # of a run whose data was changed on the way
+        if before.get("sets", self.sets) != self.sets:
+            if not any(change.startswith("data.") for change in changes):
+                raise InvalidInputError(
+                    f"`resume` finds a run in {str(self.output)!r} on other data than there is now: "
+                    f"{_difference(before['sets'], self.sets)}. Put the data back, or begin anew in another `output`."
+                )
+            self.earlier_sets = [*self.earlier_sets, before["sets"]]
+        check_writable("output", self.output / "record.json")
+        check_writable("output", self.output / "model" / "config.json")
+        check_writable("output", self.output / "checkpoints" / "step" / "progress.json")
+        check_writable("cache", self.cache / "array.npy")
         if not self.processes.is_main_process:
             self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
 
@@ -177,7 +190,7 @@ class Stage:
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or partial(shuffled_indices, size=len(dataset), **self.batches)
-        begun = {"inputs": self.inputs, "recipe": self.given}
+        begun = {"inputs": self.inputs, "recipe": self.given, "sets": self.sets, "earlier_sets": self.earlier_sets}
         trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun)
         if self.resume:
             trainer.resume()
@@ -191,24 +204,33 @@ class Stage:
             "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
             "inputs": self.inputs, "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.given.items() if key != "trainer"},
-            "sets": [source.summary for source in self.sources],
+            "sets": self.sets,
+            **({"earlier_sets": self.earlier_sets} if self.earlier_sets else {}),
             **figures,
         }  # fmt: skip
         for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
             if (beside / "record.json").is_file():  # beside a run's `model`, or a part of that
                 record["started_from"] = json.loads((beside / "record.json").read_text())
         main = self.processes.is_main_process  # what the others write is discarded
-        with writing_folder("output", self.output, replace=True) if main else TemporaryDirectory() as place:
+        with filling("output", self.output) if main else TemporaryDirectory() as place:
             model = Path(place) / "model"
             model.mkdir()
             yield model
             (model.parent / "record.json").write_text(json.dumps(record, indent=2) + "\n")
 
 
+def _difference(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> str:
+    """The first data set that is not what it was, in words."""
+    for one, other in zip_longest(before, now):
+        if one != other:
+            return f"{json.dumps(one) if one else 'nothing'} then, {json.dumps(other) if other else 'nothing'} now"
+    return "nothing differs"
+
+
 def weights_of(folder: Path) -> str:
-    """SHA-256 of all the safetensors below a folder: of their names and bytes."""
+    """SHA-256 of all the safetensors below a folder, also behind links: of their names and bytes."""
     digest = hashlib.sha256()
-    for file in sorted(folder.rglob("*.safetensors")):
+    for file in sorted(file for file in files_below(folder) if file.suffix == ".safetensors"):
         digest.update(f"{file.relative_to(folder).as_posix()}\n".encode())
         with file.open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())

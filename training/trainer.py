@@ -9,7 +9,7 @@ own, and gradients are averaged.
 
 import json
 import math
-import shutil
+import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -31,6 +31,14 @@ from tqdm.auto import tqdm
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
 from unitouch_gen.files import read_settings, write_file
 from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.checkpoints import (
+    checkpoint_folders,
+    checkpoints_in,
+    files_of_checkpoint,
+    flush,
+    last_checkpoint,
+    remove_checkpoint,
+)
 from unitouch_gen.training.recipe import Settings, Share
 
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -98,13 +106,17 @@ class Trainer:
 
     def resume(self) -> None:
         """Continues from the last checkpoint, if it is of this model and optimiser."""
-        progress, checkpoint = read_progress(self.output), checkpoints_in(self.output)[-1]
+        checkpoint = last_checkpoint(self.output)
+        progress = read_settings("resume", checkpoint / "progress.json")
         if progress["step"] > self.steps:
             raise InvalidInputError(f"`steps` is {self.steps}, but {str(checkpoint)!r} is beyond it; ask for more.")
         own = [{name: group[name] for name in ("betas", "weight_decay")} for group in self.optimizer.param_groups]
         try:
             self.accelerator.load_state(str(checkpoint))
-        except (RuntimeError, ValueError, KeyError) as error:
+        except pickle.UnpicklingError as error:
+            why = "holds a pickle of more than numbers, of which nothing was run; begin anew in another `output`."
+            raise InvalidInputError(f"`resume` finds {str(checkpoint)!r}, which {why}") from error
+        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, EOFError) as error:
             why = f"does not fit this recipe's model and trainer: {first_line(error)}"
             raise InvalidInputError(f"`resume` finds {str(checkpoint)!r}, which {why}") from error
         if self.ema is not None:
@@ -122,7 +134,8 @@ class Trainer:
         self.output.mkdir(parents=True, exist_ok=True)
         if self.main and self.step == 0:  # what an earlier run left
             (self.output / "log.jsonl").unlink(missing_ok=True)
-            shutil.rmtree(self.output / "checkpoints", ignore_errors=True)
+            for folder in checkpoint_folders(self.output):
+                remove_checkpoint(folder)
         self.objective.train()
         bar = {"desc": self.output.name, "mininterval": 5.0, "disable": not self.main}
         with tqdm(range(self.step, self.steps), initial=self.step, total=self.steps, **bar) as steps:
@@ -175,16 +188,21 @@ class Trainer:
         return {key: value.item() for key, value in means.items()}
 
     def save(self) -> None:
-        """Writes a checkpoint, and lets older ones go; without `progress.json` a checkpoint is none."""
+        """Writes a checkpoint, and removes older ones; without `progress.json` a checkpoint is none."""
         folder = self.output / "checkpoints" / f"step-{self.step:08d}"
         self.accelerator.save_state(str(folder))
         self.accelerator.wait_for_everyone()
         if self.main:
-            progress = {"step": self.step, "seconds": self.seconds, **self.progress}
+            files = files_of_checkpoint(folder)
+            for file in files:
+                flush(file)  # the checkpoint before this one goes, so a power cut must not take this one
+            names = [file.name for file in files]
+            progress = {"step": self.step, "seconds": self.seconds, "files": names, **self.progress}
             write_file("output", folder / "progress.json", json.dumps(progress))
-            for old in {*folder.parent.glob("step*")} - {*checkpoints_in(self.output)[-self.config.keep_checkpoints :]}:
-                (old / "progress.json").unlink(missing_ok=True)
-                shutil.rmtree(old)
+            kept = checkpoints_in(self.output)[-self.config.keep_checkpoints :]
+            for old in checkpoint_folders(self.output):
+                if old not in kept:
+                    remove_checkpoint(old)
         self.accelerator.wait_for_everyone()
 
     def _rows(self, step: int) -> list[int]:
@@ -192,18 +210,6 @@ class Trainer:
         indices = self.indices_of(step)
         share = len(indices) // self.accelerator.num_processes
         return [*indices[self.accelerator.process_index * share :][:share]]
-
-
-def checkpoints_in(output: Path) -> list[Path]:
-    """The whole checkpoints of a run, the last one last."""
-    return sorted(file.parent for file in (output / "checkpoints").glob("step-*/progress.json"))
-
-
-def read_progress(output: Path) -> dict[str, Any]:
-    """The progress of a run's last checkpoint: `step`, `seconds`, and what `Trainer` was passed as `progress`."""
-    if found := checkpoints_in(output):
-        return read_settings("resume", found[-1] / "progress.json")
-    raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
 
 
 def rate_at(step: int, config: TrainerConfig, steps: int) -> float:

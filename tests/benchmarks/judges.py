@@ -23,10 +23,11 @@ from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import RELIEF_CHANNELS
 from unitouch_gen.training import batches
+from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.data import Contacts, DataConfig, columns_of
 from unitouch_gen.training.image_text import SHOWN
 from unitouch_gen.training.recipe import read, read_recipe
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
+from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES
 
 SIZES = {"embedding_size": 32, "hidden_sizes": [64, 128, 256, 256], "depths": [1, 2, 3, 2]}

@@ -22,8 +22,8 @@ from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import run_commands
 from unitouch_gen.training.__main__ import app
+from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers
-from unitouch_gen.training.trainer import checkpoints_in
 
 pytest.importorskip("peft", reason="LoRA needs peft")
 SETTINGS = DistillSettings(timesteps=[999, 619, 299, 79], margin=0.02, critic_rank=2)

@@ -12,8 +12,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
+from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
+from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 
 class Matching(nn.Module):

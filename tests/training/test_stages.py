@@ -20,10 +20,10 @@ from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.__main__ import app
+from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import STAGES, Stage, weights_of
 from unitouch_gen.training.touch import TouchRecipe
-from unitouch_gen.training.trainer import checkpoints_in
 from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import World
 

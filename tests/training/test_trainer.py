@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,8 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, rate_at
+from unitouch_gen.training.checkpoints import checkpoints_in
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
@@ -133,10 +136,13 @@ def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, e
 
 
 def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tmp_path: Path) -> None:
+    """Copies under other names, and files that others put there, stay."""
     make(tmp_path, keep_checkpoints=3)[0].fit()
     assert [folder.name for folder in checkpoints_in(tmp_path)] == [f"step-{step:08d}" for step in (10, 15, 20)]
     (tmp_path / "checkpoints" / "step-00000020" / "progress.json").unlink()  # as if killed while it was written
     (tmp_path / "checkpoints" / ".DS_Store").touch()
+    (tmp_path / "checkpoints" / "step-00000010" / "notes.txt").touch()
+    shutil.copytree(tmp_path / "checkpoints" / "step-00000015", tmp_path / "checkpoints" / "step-00000015-best")
     trainer, _ = make(tmp_path)
     trainer.resume()
     assert trainer.step == 15
@@ -144,7 +150,10 @@ def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tm
     killed, _ = make(tmp_path, options={"stop_at": 8})
     with pytest.raises(KeyboardInterrupt):
         killed.fit()
-    assert [folder.name for folder in (tmp_path / "checkpoints").iterdir()] == ["step-00000005"]
+    theirs = {".DS_Store", "step-00000010", "step-00000015-best"}
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"step-00000005", *theirs}
+    assert [path.name for path in (tmp_path / "checkpoints" / "step-00000010").iterdir()] == ["notes.txt"]
+    assert (tmp_path / "checkpoints" / "step-00000015-best" / "model.safetensors").is_file()
     assert not (tmp_path / "log.jsonl").exists()
 
 
@@ -167,6 +176,47 @@ def test_a_run_that_cannot_go_on_says_why(tmp_path: Path) -> None:
     objective.trained = nn.Linear(3, 4)
     with pytest.raises(InvalidInputError, match="step-00000020', which does not fit this recipe's model"):
         Trainer(objective, data(), lambda step: [0], CONFIG, tmp_path).resume()
+
+
+class Opened:
+    """An object whose unpickling would make a file."""
+
+    def __init__(self, file: Path):
+        self.file = file
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.file,)
+
+
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "cut": lambda file: file.write_bytes(file.read_bytes()[:-40]),
+    "of zeros": lambda file: file.write_bytes(bytes(file.stat().st_size)),
+    "missing": Path.unlink,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("name", ["model.safetensors", "optimizer.bin", "random_states_0.pkl"])
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(tmp_path: Path, name: str, damage: str) -> None:
+    make(tmp_path, steps=10, keep_checkpoints=2)[0].fit()
+    before, last = checkpoints_in(tmp_path)
+    DAMAGES[damage](last / name)
+    trainer, _ = make(tmp_path)
+    with pytest.warns(UserWarning, match=rf"{last.name}/{name}' is missing or damaged; .* {before.name}"):
+        trainer.resume()
+    assert trainer.step == 5
+    DAMAGES[damage](before / name)
+    with pytest.raises(InvalidInputError, match=rf"`resume` finds '.*{last.name}/{name}' missing or damaged"):
+        make(tmp_path)[0].resume()
+
+
+def test_a_checkpoint_with_a_hostile_pickle_is_one_line_and_runs_nothing(tmp_path: Path) -> None:
+    make(tmp_path / "run")[0].fit()
+    (checkpoint,) = checkpoints_in(tmp_path / "run")
+    torch.save(Opened(tmp_path / "ran"), checkpoint / "optimizer.bin")
+    with pytest.raises(InvalidInputError, match=r"^`resume` finds .* of which nothing was run.*$"):
+        make(tmp_path / "run")[0].resume()
+    assert not (tmp_path / "ran").exists()
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_at_its_last_checkpoint(tmp_path: Path) -> None:

@@ -66,8 +66,16 @@ class RecordSet:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What a training run keeps on record of it."""
-        return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}
+        """What a training run keeps on record of it; `ids` is a hash of the names of its records."""
+        ids = sha256("\n".join(record.id for record in self.records).encode()).hexdigest()[:16]
+        return {
+            "set": self.name,
+            "kind": self.kind,
+            "split": self.chosen,
+            "sensor": self.sensor,
+            "records": len(self),
+            "ids": ids,
+        }
 
     def captions(self, variants: int) -> list[list[str]]:
         """The caption of each record, as many times as asked for."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+from accelerate.state import AcceleratorState
 from PIL import Image
 
 from tests.helpers.data_sets import RED, write_image
@@ -121,7 +122,8 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
                 *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
     words = ["touch", "--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
     run_commands(app, "unitouch_gen.training", [*words, *(part for one in settings for part in ("--set", one))])
-    assert json.loads((tmp_path / "touch" / "record.json").read_text())["sets"] == [
+    sets = json.loads((tmp_path / "touch" / "record.json").read_text())["sets"]
+    assert [{key: value for key, value in one.items() if key != "ids"} for one in sets] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))
     ]
@@ -131,3 +133,34 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
     kept = [record.touch.path for record in open_dataset(folder).split("train").by_sensor()[1].records]
     mean = torch.stack([UniTouchProcessor(32).raw_images(file)[0] for file in kept]).mean(dim=0)
     torch.testing.assert_close(model.sensor_bank.prototype("gelsight"), mean, atol=1 / 255, rtol=0)
+
+
+def test_a_run_goes_on_with_other_data_only_if_that_is_asked_for(folder, tmp_path, processor, capsys) -> None:
+    data = f"data.sets=[{{path: {folder}, split: none}}]"
+    settings = [
+        data,
+        "data.image_size=32",
+        "augment.crop=16",
+        "model.encoder_block_out_channels=[8, 8, 8, 8]",
+        "model.decoder_block_out_channels=[8, 8, 8, 8]",
+        "trainer.steps=1",
+        "trainer.batch_size=4",
+        "trainer.warmup=1",
+    ]
+    places = ["--output", str(tmp_path / "vae"), "--cache", str(tmp_path / "cache")]
+
+    def run(*words: str) -> None:
+        AcceleratorState._reset_state()  # as a process of its own would find it
+        run_commands(app, "unitouch_gen.training", ["image_vae", *places, *words])
+
+    run(*(word for setting in settings for word in ("--set", setting)))
+    before = json.loads((tmp_path / "vae" / "record.json").read_text())["sets"]
+    *rows, _ = (folder / "labels.csv").read_text().splitlines()
+    (folder / "labels.csv").write_text("\n".join(rows))
+    with pytest.raises(SystemExit, match="2"):
+        run("--resume")
+    said = capsys.readouterr().err
+    assert '"records": 5, ' in said and '"records": 4, ' in said
+    run("--resume", "--set", data, "--set", "trainer.steps=2")
+    record = json.loads((tmp_path / "vae" / "record.json").read_text())
+    assert record["earlier_sets"] == [before] and record["sets"] != before

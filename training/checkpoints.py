@@ -1,0 +1,113 @@
+"""Checkpoints of a training run: which are whole, the one to resume from, and removing older ones.
+
+runs/touch/checkpoints/step-00000250/     what accelerate's `save_state` wrote
+                                          progress.json, written last: without it a checkpoint is unfinished
+"""
+
+import json
+import os
+import re
+import warnings
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import read_settings
+
+CHECKPOINT_FILE = re.compile(
+    r"(model|optimizer|scheduler|sampler|scaler|random_states|custom_checkpoint)[\w-]*"
+    r"\.(safetensors|safetensors\.index\.json|bin|pkl|pt|json)"
+)
+"""Names that accelerate gives to files of a checkpoint."""
+
+
+def checkpoint_folders(output: Path) -> list[Path]:
+    """Folders of finished and unfinished checkpoints, the last one last; copies under other names are left out."""
+    folders = (output / "checkpoints").glob("step-*")
+    return sorted(folder for folder in folders if re.fullmatch(r"step-\d{8}", folder.name))
+
+
+def files_of_checkpoint(folder: Path) -> list[Path]:
+    """The files that accelerate wrote into the folder of a checkpoint."""
+    return sorted(file for file in folder.iterdir() if CHECKPOINT_FILE.fullmatch(file.name) and file.is_file())
+
+
+def checkpoints_in(output: Path) -> list[Path]:
+    """The finished checkpoints of a run, the last one last."""
+    return [folder for folder in checkpoint_folders(output) if (folder / "progress.json").is_file()]
+
+
+def last_checkpoint(output: Path) -> Path:
+    """The last checkpoint of a run whose files are whole.
+
+    Raises:
+        InvalidInputError: If there is none.
+
+    Warns:
+        UserWarning: If a later one is damaged.
+    """
+    later_damage: Path | None = None
+    for folder in reversed(checkpoints_in(output)):
+        damaged = _damaged_file(folder)
+        if damaged is None:
+            if later_damage is not None:
+                message = f"{str(later_damage)!r} is missing or damaged; the run goes on from {folder.name}, before it."
+                warnings.warn(message, stacklevel=2)
+            return folder
+        later_damage = later_damage or damaged
+    if later_damage is not None:
+        raise InvalidInputError(
+            f"`resume` finds {str(later_damage)!r} missing or damaged, and no whole checkpoint before it; begin anew "
+            "in another `output`."
+        )
+    raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
+
+
+def read_progress(output: Path) -> dict[str, Any]:
+    """The progress of a run's last whole checkpoint: `step`, `seconds`, and what `Trainer` was passed as `progress`."""
+    return read_settings("resume", last_checkpoint(output) / "progress.json")
+
+
+def _damaged_file(checkpoint: Path) -> Path | None:
+    """The first file of a checkpoint that is missing, cut off or changed on disk; `None` if all are whole."""
+    try:
+        names = json.loads((checkpoint / "progress.json").read_text())["files"]
+    except (ValueError, TypeError):
+        return checkpoint / "progress.json"
+    except KeyError:  # written before checkpoints listed their files
+        names = [file.name for file in files_of_checkpoint(checkpoint)]
+    for name in names:
+        file = checkpoint / name
+        try:
+            if file.suffix == ".safetensors":
+                with safe_open(file, framework="pt"):  # compares the length with what the header says
+                    pass
+            elif file.suffix in (".bin", ".pkl", ".pt"):
+                with zipfile.ZipFile(file) as archive:
+                    if archive.testzip() is not None:
+                        return file
+        except (OSError, SafetensorError, zipfile.BadZipFile):
+            return file
+    return None
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Removes the files of a checkpoint, the one that makes it whole first, and its folder if nothing else is in it."""
+    (folder / "progress.json").unlink(missing_ok=True)
+    for file in files_of_checkpoint(folder):
+        file.unlink()
+    with suppress(OSError):  # of a folder that holds files of others
+        folder.rmdir()
+
+
+def flush(file: Path) -> None:
+    """Waits until a file is on the disk."""
+    descriptor = os.open(file, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
