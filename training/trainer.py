@@ -21,6 +21,7 @@ from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.utils import send_to_device, set_seed
 from diffusers.training_utils import EMAModel
 from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
+from safetensors import SafetensorError
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
@@ -190,7 +191,11 @@ class Trainer:
     def save(self) -> None:
         """Writes a checkpoint, and removes older ones; without `progress.json` a checkpoint is none."""
         folder = self.output / "checkpoints" / f"step-{self.step:08d}"
-        self.accelerator.save_state(str(folder))
+        try:
+            self.accelerator.save_state(str(folder))
+        except (OSError, RuntimeError, SafetensorError) as error:  # of a disk that is full; torch's is a RuntimeError
+            why = f"{first_line(error)}. Make room, then go on with `--resume`."
+            raise InvalidInputError(f"`output` cannot be written to {str(folder)!r}: {why}") from error
         self.accelerator.wait_for_everyone()
         if self.main:
             files = files_of_checkpoint(folder)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from tests.helpers.processes import Child
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
@@ -208,6 +210,19 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(tmp_path: Pat
     DAMAGES[damage](before / name)
     with pytest.raises(InvalidInputError, match=rf"`resume` finds '.*{last.name}/{name}' missing or damaged"):
         make(tmp_path)[0].resume()
+
+
+def fit(output: Path, keep_checkpoints: int) -> None:
+    make(output, keep_checkpoints=keep_checkpoints)[0].fit()
+
+
+@pytest.mark.parametrize("longest", [100, 3000])
+def test_a_full_disk_ends_training_in_one_line(tmp_path: Path, longest: int) -> None:
+    child = Child(fit, tmp_path / "run", 1, folder=tmp_path, longest=longest)
+    assert child.wait() == 1
+    last = child.err.splitlines()[-1]
+    assert re.search(r"InvalidInputError: `output` cannot be written to '.*step-00000005': .*--resume", last)
+    assert checkpoints_in(tmp_path / "run") == []
 
 
 def test_a_checkpoint_with_a_hostile_pickle_is_one_line_and_runs_nothing(tmp_path: Path) -> None:
