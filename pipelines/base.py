@@ -435,7 +435,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if not safe_serialization:
             raise InvalidInputError("`safe_serialization` is False, but only safetensors are written; leave it out.")
         folder = as_path("save_directory", save_directory)
-        upload, name = kwargs.pop("push_to_hub", False), kwargs.pop("repo_id", folder.resolve().name)
+        upload = kwargs.pop("push_to_hub", False)
+        name = kwargs.pop(
+            "repo_id", os.path.basename(os.path.realpath(folder))
+        )  # Path.resolve raises on a loop of links
         networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
         if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
             raise InvalidInputError("LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`.")

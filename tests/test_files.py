@@ -1,13 +1,17 @@
 """Files and folders are whole or not there, and what cannot be read or written is one error that names the argument."""
 
+import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from tests.helpers.processes import Child, finished
 from unitouch_gen.errors import InvalidInputError
@@ -39,10 +43,10 @@ def test_a_write_that_fails_leaves_the_old_file_or_folder_and_nothing_else(tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
 
-def fill(folder: Path, content: str = "new") -> None:
+def fill(folder: Path, content: str = "new", parts: Sequence[str] = ("a.txt", "part/b.json")) -> None:
     with filling("output", folder) as place:
-        write_file("x", place / "a.txt", content)
-        write_file("x", place / "part" / "b.json", content)
+        for part in parts:
+            write_file("x", place / part, content)
 
 
 def test_a_link_stays_one(tmp_path):
@@ -82,6 +86,20 @@ def test_a_folder_that_is_filled_keeps_everything_else(tmp_path, monkeypatch):
     assert names(folder) == {"mine.txt", "a.txt"} and names(elsewhere) == {"a.txt", "b.json"}
 
 
+def test_files_get_the_mode_that_new_files_get_there(tmp_path):
+    """safetensors alone writes files that nobody else may read."""
+    before = os.umask(0o027)
+    try:
+        with filling("output", tmp_path / "model") as place:
+            save_file({"a": torch.ones(2)}, place / "a.safetensors")
+        with replacing("output", tmp_path / "b.safetensors") as partial:
+            save_file({"b": torch.ones(2)}, partial)
+    finally:
+        os.umask(before)
+    files = (tmp_path / "model" / "a.safetensors", tmp_path / "b.safetensors")
+    assert [file.stat().st_mode & 0o777 for file in files] == [0o640, 0o640]
+
+
 @pytest.fixture
 def mounted(tmp_path):
     """A folder of the machine that is mounted inside a model's folder, and that folder."""
@@ -105,11 +123,22 @@ def test_a_mounted_folder_keeps_its_files_and_may_be_written_to(mounted):
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_changes(tmp_path):
-    (tmp_path / "part" / "b.json").mkdir(parents=True)
     write_file("x", tmp_path / "a.txt", "old")
-    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*b\.json.* Nothing was changed"):
-        fill(tmp_path)
-    assert names(tmp_path) == {"a.txt"} and (tmp_path / "a.txt").read_text() == "old"
+    (tmp_path / "z" / "c.txt").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    for part in ("z/c.txt", "file/d.txt"):
+        with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .* Nothing was changed"):
+            fill(tmp_path, parts=("a.txt", "new/b.txt", part))
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", "z", "file"}
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_name_that_libraries_cannot_write_is_one_line(tmp_path):
+    folder = tmp_path / "na\udcffme"  # bytes that are not UTF-8, as Python has them
+    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*surrogates"):  # noqa: SIM117
+        with filling("output", folder):
+            str(folder).encode()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_killed_save_leaves_the_old_files_or_the_new_ones_or_a_folder_that_is_refused(tmp_path):

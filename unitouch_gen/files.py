@@ -44,7 +44,8 @@ def _writing_to(name: str, target: Path) -> Iterator[None]:
         yield
     except Exception as error:
         is_os_error = isinstance(error, OSError) or "(os error" in str(error)  # the second of libraries in Rust
-        if isinstance(error, InvalidInputError) or not is_os_error:
+        is_name = isinstance(error, UnicodeEncodeError)  # of which these want UTF-8
+        if isinstance(error, InvalidInputError) or not (is_os_error or is_name):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
         raise InvalidInputError(
@@ -65,6 +66,7 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
             partial = Path(hidden) / file.name
             yield partial
+            partial.chmod(_usual_mode(Path(hidden)))
             os.replace(partial, target)
 
 
@@ -83,6 +85,15 @@ def check_writable(name: str, file: Path) -> None:
         # os.path.exists is False for a name that is too long, where Path.exists raises.
         above = next(parent for parent in target.parents if os.path.exists(parent))
         tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above).cleanup()
+
+
+def _usual_mode(folder: Path) -> int:
+    """Permissions of new files in a folder; safetensors' own, 0600, shut out a group that shares a model."""
+    probe = folder / ".mode"
+    probe.touch()
+    mode = probe.stat().st_mode & 0o777
+    probe.unlink()
+    return mode
 
 
 def _check_replaceable(file: Path) -> None:
@@ -130,20 +141,34 @@ def _move_beside(staging: Path, target: Path) -> dict[Path, Path]:
 
     Only a move within one folder is sure to be a rename: folders inside `target` may be mounts or links.
     """
+    mode = _usual_mode(staging)
     moves: dict[Path, Path] = {}
+    new_folders: list[Path] = []
     try:
         for staged in files_below(staging):
             destination = target / staged.relative_to(staging)
-            destination.parent.mkdir(parents=True, exist_ok=True)
             _check_replaceable(destination)
+            _make_folders(destination.parent, new_folders)
             beside = destination.with_name(f".{destination.name}{staging.name}")
             moves[beside] = destination
             shutil.move(staged, beside)
+            beside.chmod(mode)
     except BaseException:
         for beside in moves:
             beside.unlink(missing_ok=True)
+        for folder in reversed(new_folders):
+            folder.rmdir()
         raise
     return moves
+
+
+def _make_folders(folder: Path, made: list[Path]) -> None:
+    """Makes a folder and those above it that are not there, and adds them to `made`."""
+    missing = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
+    for one in reversed(missing):
+        one.mkdir()
+        made.append(one)
+    folder.mkdir(exist_ok=True)  # raises if a file is there
 
 
 def _put_in_place(moves: dict[Path, Path], target: Path) -> None:
