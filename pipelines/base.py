@@ -41,7 +41,7 @@ from unitouch_gen.errors import (
     check_unused,
     describe,
 )
-from unitouch_gen.files import as_path, filling, local_folder, reading
+from unitouch_gen.files import as_path, local_folder, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
@@ -49,6 +49,7 @@ from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
 from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
+from unitouch_gen.saving import filling
 
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None

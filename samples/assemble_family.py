@@ -14,7 +14,7 @@ from diffusers import DDPMScheduler, DEISMultistepScheduler, EulerAncestralDiscr
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError, run_commands
-from unitouch_gen.files import filling
+from unitouch_gen.saving import filling
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.stages import STAGES, weights_of
 from unitouch_gen.training.touch_llm import PROMPT

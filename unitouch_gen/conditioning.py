@@ -16,7 +16,7 @@ from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
 from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.files import saved_whole
+from unitouch_gen.saving import saved_whole
 
 QUALITY_PROMPT = "high quality"
 """The paper's prompt for touches: the most frequent training prompt, and the default."""

@@ -21,11 +21,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_dtype, check_file, check_finite, check_kind, first_line
-from unitouch_gen.files import as_path, check_writable, filling
+from unitouch_gen.files import as_path, check_writable
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
 from unitouch_gen.models.sensors import SensorBank
+from unitouch_gen.saving import filling
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 """Which encoders are read from which file."""

@@ -1,27 +1,19 @@
-"""Files and folders: written whole, put in place by renames, and read with errors that name the argument."""
+"""Files that are written whole, and files, folders and tables that are read with errors that name the argument."""
 
 import csv
 import errno
-import functools
-import inspect
 import io
 import json
 import os
 import re
-import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
@@ -34,11 +26,9 @@ _LOADING = threading.RLock()  # libraries patch torch in all threads while they 
 UNFINISHED = ".unfinished-save"
 """Lies in a folder while files of a save take their places, and stays there if the save is cut off."""
 
-SHARD_NUMBER = re.compile(r"-\d+-of-\d+(?=\.safetensors$)")
-
 
 @contextmanager
-def _writing_to(name: str, target: Path) -> Iterator[None]:
+def writing_to(name: str, target: Path) -> Iterator[None]:
     """Turns errors of writing into one that names the argument."""
     try:
         yield
@@ -60,13 +50,13 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
     Raises `InvalidInputError` if it cannot be written, or is a folder or a device; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    with _writing_to(name, target):
+    with writing_to(name, target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        _check_replaceable(target)
+        check_replaceable(target)
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
             partial = Path(hidden) / file.name
             yield partial
-            partial.chmod(_usual_mode(Path(hidden)))
+            share_as_usual([partial], Path(hidden))
             os.replace(partial, target)
 
 
@@ -80,172 +70,33 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
 def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    with _writing_to(name, target):
-        _check_replaceable(target)
+    with writing_to(name, target):
+        check_replaceable(target)
         # os.path.exists is False for a name that is too long, where Path.exists raises.
         above = next(parent for parent in target.parents if os.path.exists(parent))
         tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above).cleanup()
 
 
-def _usual_mode(folder: Path) -> int:
-    """Permissions of new files in a folder; safetensors' own, 0600, shut out a group that shares a model."""
+def share_as_usual(files: Iterable[Path], folder: Path) -> None:
+    """Gives files the permissions that new files in a folder get; safetensors' own, 0600, shut out a group."""
     probe = folder / ".mode"
     probe.touch()
     mode = probe.stat().st_mode & 0o777
     probe.unlink()
-    return mode
+    for file in files:
+        with suppress(OSError):  # of file systems without permissions
+            file.chmod(mode)
 
 
-def _check_replaceable(file: Path) -> None:
+def check_replaceable(file: Path) -> None:
     """Raises `FileExistsError` where there is something other than a file."""
     if os.path.exists(file) and not os.path.isfile(file):
         raise FileExistsError(errno.EEXIST, f"{file.name} is there and is not a file")
 
 
-@contextmanager
-def filling(name: str, folder: Path) -> Iterator[Path]:
-    """An empty folder to write to, whose files take their places in `folder` when the block ends without an error.
-
-    Everything else in `folder` stays as it is, but for older weights of the components that were written (another
-    number of shards). Files take their places one by one, weights first and configs last. While they do, and if that is
-    cut off, `UNFINISHED` lies in `folder`, and `reading` refuses it.
-
-    Raises:
-        InvalidInputError: If `folder` cannot be written to; what was there stays.
-    """
-    target = Path(os.path.realpath(folder))
-    with _writing_to(name, target):
-        is_new = not os.path.exists(target)
-        target.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
-        try:
-            yield staging
-            moves = _move_beside(staging, target)
-        except BaseException:
-            shutil.rmtree(staging, ignore_errors=True)
-            if is_new:
-                with suppress(OSError):  # of a folder that somebody else has filled meanwhile
-                    target.rmdir()
-            raise
-    try:
-        with _locked(target):
-            _put_in_place(moves, target)
-    except OSError as error:
-        why = f"{error.strerror}. Files that are not in place yet lie beside it, as {staging.name}. Save again."
-        raise InvalidInputError(f"`{name}` was written in part to {str(target)!r}: {why}") from error
-    shutil.rmtree(staging, ignore_errors=True)
-
-
-def _move_beside(staging: Path, target: Path) -> dict[Path, Path]:
-    """Moves staged files beside their destinations, under hidden names; returns destinations by those.
-
-    Only a move within one folder is sure to be a rename: folders inside `target` may be mounts or links.
-    """
-    mode = _usual_mode(staging)
-    moves: dict[Path, Path] = {}
-    new_folders: list[Path] = []
-    try:
-        for staged in files_below(staging):
-            destination = target / staged.relative_to(staging)
-            _check_replaceable(destination)
-            _make_folders(destination.parent, new_folders)
-            beside = destination.with_name(f".{destination.name}{staging.name}")
-            moves[beside] = destination
-            shutil.move(staged, beside)
-            beside.chmod(mode)
-    except BaseException:
-        for beside in moves:
-            beside.unlink(missing_ok=True)
-        for folder in reversed(new_folders):
-            folder.rmdir()
-        raise
-    return moves
-
-
-def _make_folders(folder: Path, made: list[Path]) -> None:
-    """Makes a folder and those above it that are not there, and adds them to `made`."""
-    missing = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
-    for one in reversed(missing):
-        one.mkdir()
-        made.append(one)
-    folder.mkdir(exist_ok=True)  # raises if a file is there
-
-
-def _put_in_place(moves: dict[Path, Path], target: Path) -> None:
-    """Renames files to their destinations, then removes what earlier saves left of the same weights."""
-    earlier = _earlier_weights([*moves.values()])
-    folders = sorted({target, *(destination.parent for destination in moves.values())})
-    for folder in folders:
-        (folder / UNFINISHED).touch()
-    for beside, destination in sorted(moves.items(), key=lambda move: _order(move[1])):
-        os.replace(beside, destination)
-    for file in earlier:
-        file.unlink(missing_ok=True)
-    for folder in reversed(folders):
-        (folder / UNFINISHED).unlink(missing_ok=True)
-
-
-def _order(destination: Path) -> tuple[bool, int, Path]:
-    """A key to sort files by: weights before what describes them, and what lies deeper before what names it."""
-    return destination.suffix == ".json", -len(destination.parts), destination
-
-
-def _earlier_weights(written: Sequence[Path]) -> set[Path]:
-    """Weights of the same components and variants under other names: a single file, or an index and its shards."""
-    earlier = set[Path]()
-    for file in written:
-        if file.suffix != ".safetensors":
-            continue
-        single = SHARD_NUMBER.sub("", file.name)  # model.fp16-00001-of-00002.safetensors: model.fp16.safetensors
-        component, *variant = single.removesuffix(".safetensors").split(".", 1)
-        index = file.with_name(".".join([component, "safetensors", "index", *variant, "json"]))
-        shards = [shard for shard in _shards_in(index) if SHARD_NUMBER.sub("", shard) == single]
-        earlier |= {index, *(file.with_name(name) for name in (single, *shards))}
-    return earlier - {*written}
-
-
-def _shards_in(index: Path) -> set[str]:
-    """Names of the files that an index of sharded weights lists; none where there is no such index."""
-    try:
-        return set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return set()
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Holds a lock on a folder, so that the files of two saves do not mix; without one where the system has none."""
-    if fcntl is None:
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # of file systems without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
 def is_unfinished(folder: Path) -> bool:
     """Whether a save into a folder is under way or was cut off."""
     return os.path.exists(folder / UNFINISHED)
-
-
-def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
-    """A `save_pretrained` whose files take their places when all of them are written; uploads come after that."""
-
-    @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
-    def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
-        folder = as_path("save_directory", save_directory)
-        repo_id = kwargs.pop("repo_id", None)
-        with filling("save_directory", folder) as place:
-            save(self, place, *args, **kwargs)
-        if push_to_hub:
-            given = {name: kwargs[name] for name in kwargs.keys() & inspect.signature(self.push_to_hub).parameters}
-            self.push_to_hub(repo_id or folder.resolve().name, **given)
-
-    return save_pretrained
 
 
 # Reading --------------------------------------------------------------------------------------------------------------

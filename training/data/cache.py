@@ -11,7 +11,8 @@ from torch import Tensor
 from tqdm.contrib.concurrent import thread_map
 
 from unitouch_gen.errors import first_line
-from unitouch_gen.files import filling, is_unfinished, replacing
+from unitouch_gen.files import is_unfinished, replacing
+from unitouch_gen.saving import filling
 from unitouch_gen.training.data.sets import RecordSet
 
 

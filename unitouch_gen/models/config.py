@@ -13,7 +13,7 @@ from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number, check_texts
-from unitouch_gen.files import saved_whole
+from unitouch_gen.saving import saved_whole
 
 
 def check_halved(patch_size: int, *lengths: int) -> None:

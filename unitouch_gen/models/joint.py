@@ -17,11 +17,12 @@ from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_choice, check_dtype, check_file
-from unitouch_gen.files import local_folder, read_settings, reading, saved_whole
+from unitouch_gen.files import local_folder, read_settings, reading
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, local_mean, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
+from unitouch_gen.saving import saved_whole
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 

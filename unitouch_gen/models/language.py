@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from transformers import PreTrainedModel
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.files import saved_whole
+from unitouch_gen.saving import saved_whole
 
 
 class SwiGLU(nn.Module):

@@ -14,10 +14,11 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_texts
-from unitouch_gen.files import local_folder, reading, saved_whole
+from unitouch_gen.files import local_folder, reading
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
 from unitouch_gen.models.videos import VIDEOS, firmest
+from unitouch_gen.saving import saved_whole
 
 LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
 

@@ -1,0 +1,145 @@
+"""Folders of models: nothing in them is lost, whatever is there, fails, is killed, or is saved at the same time."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from tests.helpers.processes import Child, finished
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import is_unfinished, reading, replacing, write_file
+from unitouch_gen.saving import filling
+
+
+def names(folder: Path) -> set[str]:
+    return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+def fill(folder: Path, content: str = "new", parts: Sequence[str] = ("a.txt", "part/b.json")) -> None:
+    with filling("output", folder) as place:
+        for part in parts:
+            write_file("x", place / part, content)
+
+
+def test_a_save_that_fails_leaves_the_old_folder_and_nothing_else(tmp_path):
+    fill(tmp_path / "model", "old")
+    for folder in ("model", "new"):
+        with pytest.raises(RuntimeError), filling("output", tmp_path / folder) as place:  # noqa: PT012
+            write_file("x", place / "a.txt", "half")
+            raise RuntimeError
+    assert names(tmp_path) == {"model/a.txt", "model/part/b.json"}
+    assert (tmp_path / "model" / "a.txt").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_folder_that_is_filled_keeps_everything_else(tmp_path, monkeypatch):
+    """The folder itself, its mode, links and empty folders in it, and files of others; also as the working folder."""
+    folder, elsewhere = tmp_path / "model", tmp_path / "elsewhere"
+    write_file("x", folder / "mine.txt", "mine")
+    write_file("x", elsewhere / "a.txt", "theirs")
+    (folder / ".git" / "refs").mkdir(parents=True)
+    (folder / "part").symlink_to(elsewhere)
+    (folder / "a.txt").symlink_to(elsewhere / "a.txt")
+    folder.chmod(0o2770)
+    before = folder.stat()
+    monkeypatch.chdir(folder)
+    fill(Path())
+    assert (folder.stat().st_ino, folder.stat().st_mode) == (before.st_ino, before.st_mode)
+    assert Path.cwd() == folder and (folder / ".git" / "refs").is_dir() and (folder / "part").is_symlink()
+    assert (folder / "mine.txt").read_text() == "mine"
+    # What a link points to is not written through; a folder behind one is the user's way to say where files go.
+    assert (elsewhere / "a.txt").read_text() == "theirs" and (folder / "a.txt").read_text() == "new"
+    assert names(folder) == {"mine.txt", "a.txt"} and names(elsewhere) == {"a.txt", "b.json"}
+
+
+def test_files_get_the_mode_that_new_files_get_there(tmp_path):
+    """safetensors alone writes files that nobody else may read."""
+    before = os.umask(0o027)
+    try:
+        with filling("output", tmp_path / "model") as place:
+            save_file({"a": torch.ones(2)}, place / "a.safetensors")
+        with replacing("output", tmp_path / "b.safetensors") as partial:
+            save_file({"b": torch.ones(2)}, partial)
+    finally:
+        os.umask(before)
+    files = (tmp_path / "model" / "a.safetensors", tmp_path / "b.safetensors")
+    assert [file.stat().st_mode & 0o777 for file in files] == [0o640, 0o640]
+
+
+@pytest.fixture
+def mounted(tmp_path):
+    """A folder of the machine that is mounted inside a model's folder, and that folder."""
+    host, inside = tmp_path / "host", tmp_path / "model" / "part"
+    write_file("x", host / "precious.txt", "theirs")
+    inside.mkdir(parents=True)
+    if shutil.which("mount") is None or subprocess.run(["mount", "--bind", host, inside], check=False).returncode:
+        pytest.skip("folders cannot be mounted without rights")
+    yield host, inside
+    subprocess.run(["umount", inside], check=True)
+
+
+def test_a_mounted_folder_keeps_its_files_and_may_be_written_to(mounted):
+    host, inside = mounted
+    fill(inside.parent)
+    assert names(host) == {"precious.txt", "b.json"} and names(inside.parent) == {
+        "a.txt", "part/precious.txt", "part/b.json",
+    }  # fmt: skip
+    fill(inside)  # a mount by itself, which no rename can replace
+    assert (host / "a.txt").read_text() == "new" and (host / "precious.txt").read_text() == "theirs"
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_changes(tmp_path):
+    write_file("x", tmp_path / "a.txt", "old")
+    (tmp_path / "z" / "c.txt").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    for part in ("z/c.txt", "file/d.txt"):
+        with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .* Nothing was changed"):
+            fill(tmp_path, parts=("a.txt", "new/b.txt", part))
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", "z", "file"}
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_name_that_libraries_cannot_write_is_one_line(tmp_path):
+    folder = tmp_path / "na\udcffme"  # bytes that are not UTF-8, as Python has them
+    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .*surrogates"):  # noqa: SIM117
+        with filling("output", folder):
+            str(folder).encode()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_save_leaves_the_old_files_or_the_new_ones_or_a_folder_that_is_refused(tmp_path):
+    """Wherever the process is killed, files of two saves are never read as one model; the next save mends it."""
+    folder = tmp_path / "model"
+    fill(folder, "old")
+    changes = finished(Child(fill, folder, "old", folder=tmp_path)).changes
+    states = set()
+    for killed_at in range(1, changes + 1):
+        assert Child(fill, folder, "new", folder=tmp_path, killed_at=killed_at).wait() == -9
+        if is_unfinished(folder):
+            states.add("unfinished")
+            with pytest.raises(InvalidInputError, match=r"`model` is .*a save into it is under way or was cut off"):
+                reading("model", folder).__enter__()
+        else:
+            one, other = (folder / "a.txt").read_text(), (folder / "part" / "b.json").read_text()
+            assert one == other
+            states.add(one)
+        fill(folder, "old")
+        assert not is_unfinished(folder) and (folder / "part" / "b.json").read_text() == "old"
+    assert states == {"old", "unfinished", "new"}
+
+
+def test_of_two_saves_at_once_one_is_there(tmp_path):
+    def fill_again(content: str) -> None:
+        for _ in range(20):
+            fill(tmp_path / "model", content)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(fill_again, ("one", "two")))
+    one, other = (tmp_path / "model" / "a.txt").read_text(), (tmp_path / "model" / "part" / "b.json").read_text()
+    assert one == other and names(tmp_path / "model") == {"a.txt", "part/b.json"}
