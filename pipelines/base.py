@@ -5,10 +5,9 @@ conditioning, goes from noise to latents (`_denoise`), and from latents to pictu
 """
 
 import copy
-import math
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import wraps
@@ -24,7 +23,6 @@ from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.pipeline_utils import StableDiffusionMixin
 from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
-from safetensors import safe_open
 from torch import Tensor
 
 from unitouch_gen.conditioning import match_norm
@@ -41,7 +39,7 @@ from unitouch_gen.errors import (
     check_unused,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, reading
+from unitouch_gen.files import as_path, check_filled, check_saved, local_folder, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
@@ -405,10 +403,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         # diffusers' download cannot resolve our components.
         folder = local_folder(name, pretrained_model_name_or_path, **kwargs)
         with reading(name, folder):
+            check_components(cls, folder, kwargs)
             pipe = super().from_pretrained(folder, **kwargs)
-            conditioning = {"embedding_bank", "backgrounds", "image_normalizer", "language_bridge"}
-            for part in {"unet", "vae", "text_encoder", *conditioning} - kwargs.keys():
-                check_filled(folder / part, getattr(pipe, part, None))
+            for part, network in pipe.components.items():
+                if part not in kwargs and part != "unitouch" and isinstance(network, torch.nn.Module):
+                    check_filled(folder / part, network)
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
         return pipe
 
@@ -472,25 +471,19 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
 
 
-def check_filled(folder: Path, network: Any) -> None:
-    """Raises if a folder's files lack numbers of the network, which diffusers would draw at random."""
-    if not isinstance(network, torch.nn.Module) or not folder.is_dir():
-        return
-    sizes: dict[str, int] = {}
-    for path in folder.glob("*.safetensors"):
-        with safe_open(path, framework="pt") as file:
-            for name in file.keys():  # noqa: SIM118 - not a dict
-                if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
-                    sizes[name] = math.prod(file.get_slice(name).get_shape())
-    tensors = [*network.state_dict().values()]
-    lacking = [one for one in tensors if one.is_meta]
-    # Tied weights are stored once.
-    held, wanted = sum(sizes.values()), sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
-    if lacking or held < wanted:
-        raise InvalidInputError(
-            f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
-            "network."
-        )
+def check_components(kind: type[DiffusionPipeline], folder: Path, given: Container[str]) -> None:
+    """Raises if a component that model_index.json names, and that is not `given`, lacks files."""
+    kinds = {
+        "tokenizer": "tokenizer",
+        "processor": "processor",
+        "scheduler": "scheduler",
+        "image_noising_scheduler": "scheduler",
+    }
+    index = kind.load_config(folder)
+    for name in kind._get_signature_keys(kind)[0]:
+        saved = index.get(name)
+        if isinstance(saved, list | tuple) and saved[1:] != [None] and name not in given:
+            check_saved(folder / name, kinds.get(name, "network"))
 
 
 def check_count(name: str, count: int, inputs: int) -> None:

@@ -9,10 +9,10 @@ from diffusers import StableUnCLIPImg2ImgPipeline
 from transformers import CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import check_dtype
-from unitouch_gen.files import NEVER_READ, local_folder, reading
+from unitouch_gen.files import NEVER_READ, check_filled, local_folder, read_network, reading
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import check_filled
+from unitouch_gen.pipelines.base import check_components
 
 
 def read_joint(
@@ -36,13 +36,15 @@ def read_unclip(
     own = "image" in model.known_modalities
     unread = [*NEVER_READ, *([] if variant else ["*.fp16.*"]), *(["image_encoder/*"] if own else [])]
     folder = local_folder("unclip", unclip, ignore_patterns=unread, **hub)
-    files: dict[str, Any] = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
+    files: dict[str, Any] = {"dtype": check_dtype("dtype", dtype), "variant": variant}
     with reading("unclip", folder):
-        pipe = StableUnCLIPImg2ImgPipeline.from_pretrained(folder, **files, feature_extractor=None, image_encoder=None)
-        for part in ("unet", "vae"):
+        unused = {"feature_extractor": None, "image_encoder": None}
+        check_components(StableUnCLIPImg2ImgPipeline, folder, unused)
+        pipe = StableUnCLIPImg2ImgPipeline.from_pretrained(folder, **files, **unused, use_safetensors=True)
+        for part in ("unet", "vae", "text_encoder", "image_normalizer"):
             check_filled(folder / part, getattr(pipe, part))
         if not own and (folder / "image_encoder").is_dir():
-            encoder = CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder", **files)
+            encoder = read_network(CLIPVisionModelWithProjection, folder / "image_encoder", **files)
             model.vision_model = encoder
             model.config.vision_config = encoder.config
     return pipe

@@ -1,6 +1,7 @@
 """Pipelines of the built-in tiny family; components they share are stored once."""
 
 import copy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from transformers import AutoTokenizer, LlamaForCausalLM
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, needed
-from unitouch_gen.files import as_path, read_settings, reading
+from unitouch_gen.files import as_path, read_network, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
-from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
+from unitouch_gen.models.processing import read_tokenizer
+from unitouch_gen.pipelines.base import UniTouchPipeline
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
@@ -54,11 +56,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
     folder = family / ("touch-to-image" if teacher == "stylization" else teacher)  # which share their networks
 
-    def stored(part: Any, place: Path) -> Any:
-        made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
-        check_filled(place, made)
-        return made.eval()
-
+    stored = partial(read_network, torch_dtype=dtype)
     with reading("family", family):
         joint, processor = joint_space(family, dtype)
         parts: dict[str, Any] = {"unitouch": joint, "processor": processor}
@@ -70,7 +68,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
             language = folder / "language_model"
             parts["language_model"] = stored(LlamaForCausalLM, language)
             parts["language_bridge"] = stored(LanguageBridge, folder / "language_bridge")
-            parts["tokenizer"] = AutoTokenizer.from_pretrained(language)
+            parts["tokenizer"] = read_tokenizer("family", language, AutoTokenizer)
         else:
             vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
             autoencoder = read_settings("family", vae / "config.json").get("_class_name")

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from transformers import CLIPTextModel
 
 from unitouch_gen.errors import InvalidInputError, check_choice, first_line, needed
-from unitouch_gen.files import class_name, read_settings, reading
+from unitouch_gen.files import class_name, read_network, read_settings, reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
 from unitouch_gen.models.processing import read_tokenizer
@@ -180,9 +180,9 @@ def conditioned_pictures(
     """The objective that trains a network of pictures, and its data."""
     folder, processor = stage.folders["model"], stage.processor
     with reading("model", folder):
-        normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", use_safetensors=True)
+        normalizer = read_network(StableUnCLIPImageNormalizer, folder / "image_normalizer")
         noising = DDPMScheduler.from_pretrained(folder / "image_noising_scheduler")
-        text_encoder = CLIPTextModel.from_pretrained(folder / "text_encoder", use_safetensors=True)
+        text_encoder = read_network(CLIPTextModel, folder / "text_encoder")
         processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
     dataset, captions = unclip.inputs(stage, joint, vae)
     how = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
@@ -202,7 +202,7 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     settings = read_settings("model", folder / "model_index.json")
     conditioned_by = CONDITIONED[check_choice("model: _class_name", class_name(settings), CONDITIONED)]
     with reading("model", folder):
-        unet = UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True)
+        unet = read_network(UNet2DConditionModel, folder / "unet")
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
         joint, vae = stage.joint_space("image"), read_autoencoder(folder / "vae")
     add_layers(unet, recipe.lora, recipe.objective.critic_rank, stage.folders.get("init"))

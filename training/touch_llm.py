@@ -15,7 +15,9 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerBase
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import read_network, reading
 from unitouch_gen.models.language import LanguageBridge
+from unitouch_gen.models.processing import read_tokenizer
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts, DrawnContacts, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
@@ -99,11 +101,13 @@ def main(stage: Stage, recipe: TouchLLMRecipe) -> None:
     llama = stage.folders.get("llama")  # of `touch_llm` alone
     if llama is not None and recipe.model:
         raise InvalidInputError("`model` is that of `--llama`; leave the section out.")
-    joint, splits = stage.joint_space("image"), stage.splits("image", "text")
-    tokenizer = AutoTokenizer.from_pretrained(llama or TOUCH_TO_TEXT / "language_model")  # this one knows every byte
+    words = llama or TOUCH_TO_TEXT / "language_model"  # which knows every byte
+    tokenizer = read_tokenizer("llama", words, AutoTokenizer)
     if llama is not None:
-        model = LlamaForCausalLM.from_pretrained(llama, dtype=torch.float32, use_safetensors=True)
-    else:
+        with reading("llama", llama):
+            model = read_network(LlamaForCausalLM, llama, dtype=torch.float32)
+    joint, splits = stage.joint_space("image"), stage.splits("image", "text")
+    if llama is None:
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
         model = LlamaForCausalLM(build("model", LlamaConfig, recipe.model, vocab_size=len(tokenizer), **special))
     given = {"language_model": model, "embedding_dim": joint.config.projection_dim}

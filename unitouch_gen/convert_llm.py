@@ -16,6 +16,7 @@ from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import InvalidInputError, check_dtype
 from unitouch_gen.files import local_folder, reading
 from unitouch_gen.models.language import LanguageBridge
+from unitouch_gen.models.processing import read_tokenizer
 
 OUTER = {"model.embed_tokens": "tok_embeddings", "model.norm": "norm", "lm_head": "output"}
 INNER = {
@@ -42,15 +43,21 @@ def read_touch_llm(
     `llama` is a folder or repository in transformers' layout, with its tokenizer. Raises `InvalidInputError` if a file
     cannot be read, or they do not fit.
     """
-    dtype, folder = check_dtype("dtype", dtype), local_folder("llama", llama)
+    dtype = check_dtype("dtype", dtype)
+    folder = local_folder("llama", llama)
     if not (folder / "config.json").is_file():
         raise InvalidInputError(f"`llama` is {str(folder)!r}, which has no config.json; pass transformers' layout.")
+    tokenizer = read_tokenizer("llama", folder, AutoTokenizer)
     tensors = open_checkpoint("bridge", bridge)
     model: Any
     with reading("llama", folder):
-        tokenizer = AutoTokenizer.from_pretrained(folder)
         config = LlamaConfig.from_pretrained(folder, attention_bias=True, mlp_bias=True)  # which a LLaMA has not
-        model = LlamaForCausalLM.from_pretrained(folder, config=config, dtype=dtype, use_safetensors=True)
+        model, loaded = LlamaForCausalLM.from_pretrained(
+            folder, config=config, dtype=dtype, use_safetensors=True, output_loading_info=True
+        )
+        lacking = sorted(key for key in loaded["missing_keys"] if not key.endswith(".bias"))
+        if lacking:
+            raise InvalidInputError(f"it lacks {len(lacking)} tensors, such as {lacking[0]}; fetch it again.")
     try:
         made = bridge_of(tensors, model.config.num_hidden_layers)
         lay_over(model, tensors)

@@ -4,6 +4,7 @@ import csv
 import errno
 import io
 import json
+import math
 import os
 import re
 import tempfile
@@ -192,6 +193,58 @@ def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.load
         why = first_line(error)
         raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read: {why}.") from error
     return found
+
+
+SAVED_FILES = {
+    "network": (["config.json"], ["*.safetensors"]),
+    "scheduler": (["scheduler_config.json"],),
+    "processor": (["preprocessor_config.json"],),
+    "tokenizer": (["tokenizer_config.json"], ["tokenizer.json", "vocab.*", "*.model"]),
+}
+"""Files of each kind of component, as patterns; of those in one list, any will do."""
+
+
+def check_saved(folder: Path, kind: str) -> None:
+    """Raises if a folder lacks one of the `SAVED_FILES` of a kind, as after a download that stopped.
+
+    Without them, transformers builds an empty tokenizer, or a network of its default size.
+    """
+    for patterns in SAVED_FILES[kind]:
+        if not any(os.path.isfile(file) for pattern in patterns for file in folder.glob(pattern)):
+            wanted = " or ".join(patterns)
+            raise InvalidInputError(f"`{folder}` holds no {wanted}; it is not whole, so fetch or save it again.")
+
+
+def check_filled(folder: Path, network: Any) -> None:
+    """Raises if a folder's files lack numbers of a network, which its library would draw at random."""
+    from safetensors import safe_open
+
+    sizes: dict[str, int] = {}
+    for path in folder.glob("*.safetensors"):
+        with safe_open(path, framework="pt") as file:
+            for name in file.keys():  # noqa: SIM118 - not a dict
+                if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
+                    sizes[name] = math.prod(file.get_slice(name).get_shape())
+    tensors = [*network.state_dict().values()]
+    lacking = [one for one in tensors if one.is_meta]
+    # Tied weights are stored once.
+    held, wanted = sum(sizes.values()), sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
+    if lacking or held < wanted:
+        raise InvalidInputError(
+            f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
+            "network."
+        )
+
+
+def read_network(kind: Any, folder: Path, **options: Any) -> Any:
+    """A network of diffusers or transformers from its folder of safetensors.
+
+    `options` are those of its `from_pretrained`. Raises if the folder does not hold the whole network.
+    """
+    check_saved(folder, "network")
+    network = kind.from_pretrained(folder, use_safetensors=True, **options)
+    check_filled(folder, network)
+    return network
 
 
 def class_name(settings: dict[str, Any]) -> Any:

@@ -12,9 +12,11 @@ from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
 from tests.helpers.calls import Call, quiet
+from tests.helpers.components import make_language_parts
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.joint import MODULES
-from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines import TouchToImagePipeline, TouchToTextPipeline
 
 NETWORKS = ("unitouch", "image_normalizer", "text_encoder", "unet", "vae")
 OPTIONAL = ("unitouch", "processor", "tokenizer", "text_encoder", "embedding_bank")
@@ -116,6 +118,41 @@ def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(t
             load(there)
         with pytest.raises(InvalidInputError, match="`use_safetensors` is False"):
             load(there, use_safetensors=False)
+
+
+def test_a_folder_that_lacks_any_of_its_files_is_refused(components, tmp_path):
+    """As a download that stopped leaves it. transformers would make an empty tokenizer, and a LLaMA of 7 B."""
+    joint = {name: components[name] for name in ("unitouch", "processor")}
+    bank = EmbeddingBank.of(torch.ones(3, 16))
+    for pipe in (
+        TouchToImagePipeline(**components | {"embedding_bank": bank}),
+        TouchToTextPipeline(**make_language_parts(), **joint),
+    ):
+        folder = tmp_path / type(pipe).__name__
+        pipe.save_pretrained(folder, max_shard_size="60KB")
+        files = [*folder.rglob("*.json"), *folder.rglob("*.safetensors")]
+        for file in files:
+            if file.name == "generation_config.json":  # which models may lack
+                continue
+            away = file.rename(tmp_path / "away")
+            with pytest.raises(InvalidInputError, match=f"{file.parent}"):
+                type(pipe).from_pretrained(folder)
+            away.rename(file)
+        shutil.move(folder / "tokenizer", tmp_path / "away")
+        with pytest.raises(InvalidInputError, match=r"tokenizer` holds no tokenizer_config\.json"):
+            type(pipe).from_pretrained(folder)
+        assert type(pipe).from_pretrained(folder, tokenizer=pipe.tokenizer).tokenizer is pipe.tokenizer
+        shutil.move(tmp_path / "away", folder / "tokenizer")
+
+
+def test_a_language_model_that_is_not_filled_is_refused(tmp_path):
+    TouchToTextPipeline(**make_language_parts()).save_pretrained(tmp_path)
+    file = tmp_path / "language_model" / "model.safetensors"
+    state = load_file(file)
+    del state["model.layers.0.mlp.up_proj.weight"]
+    save_file(state, file, metadata={"format": "pt"})
+    with pytest.raises(InvalidInputError, match=r"language_model` holds \d+ of the \d+ numbers"):
+        TouchToTextPipeline.from_pretrained(tmp_path)
 
 
 def test_with_lora_loaded_nothing_is_saved_until_it_is_fused_or_unloaded(pipe, touch, tmp_path):

@@ -11,7 +11,7 @@ from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
-from unitouch_gen.files import read_settings
+from unitouch_gen.files import read_network, read_settings
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderTiny | VQModel
 
@@ -26,7 +26,7 @@ def autoencoder_class(argument: str, name: Any) -> Any:
 def read_autoencoder(folder: Path) -> Autoencoder:
     """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
     kind = autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
-    return kind.from_pretrained(folder, use_safetensors=True).eval().requires_grad_(False)
+    return read_network(kind, folder).requires_grad_(False)
 
 
 def scale_factor(vae: Autoencoder) -> int:

@@ -14,7 +14,7 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_texts
-from unitouch_gen.files import local_folder, reading
+from unitouch_gen.files import check_saved, local_folder, reading
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
 from unitouch_gen.models.videos import VIDEOS, firmest
@@ -32,12 +32,11 @@ def tokenize(tokenizer: Any, texts: list[str]) -> Any:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
 
-def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
-    """A CLIP tokenizer from its folder, which the user passed as the argument `name`."""
+def read_tokenizer(name: str, folder: Path, kind: Any = CLIPTokenizer) -> Any:
+    """A tokenizer from its folder, which the user passed as the argument `name`; `kind` is its class."""
     with reading(name, folder):
-        if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
-            raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
-        return CLIPTokenizer.from_pretrained(folder)
+        check_saved(folder, "tokenizer")
+        return kind.from_pretrained(folder)
 
 
 def _still(name: str, touch: Any) -> Any:
@@ -142,6 +141,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
             if not (folder / FEATURE_EXTRACTOR_NAME).is_file():
                 raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
             processor = super().from_pretrained(folder, **kwargs)
-        if (folder / "tokenizer_config.json").is_file():
+        if any((folder / file).is_file() for file in ("tokenizer_config.json", "tokenizer.json", "vocab.json")):
             processor.tokenizer = read_tokenizer(name, folder)
         return processor
