@@ -4,7 +4,6 @@ A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used 
 names the argument, what came, and what to do.
 """
 
-import io
 import math
 import os
 import sys
@@ -14,6 +13,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
+
+from unitouch_gen.streams import open_standard_streams
 
 if TYPE_CHECKING:  # so the command line can say what is wrong before torch is imported, which takes seconds
     import torch
@@ -49,8 +50,7 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
     def say(message: Any, *place: Any) -> None:
         print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
 
-    if isinstance(sys.stdout, io.TextIOWrapper):  # prints names of files in another encoding as they are
-        sys.stdout.reconfigure(errors="surrogateescape")
+    open_standard_streams()
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
         with warnings.catch_warnings():

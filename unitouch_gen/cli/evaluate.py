@@ -75,11 +75,12 @@ def evaluate(
             known = [name for name in NAMED if name in joint.config.sensors]
             sets = of_world(place, joint, processor, known, range(seeds), objects, grasps=table == "grasp")
         rows = figures_of(table, sets, joint, processor, pipe, each)
-    show(table, rows)
     if output is not None:
         facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
         content = json.dumps({"table": table, "rows": rows, **facts}, indent=2)
         write_file("--output", output / f"{table}.json", content + "\n")
+    show(table, rows)
+    if output is not None:
         echo(f"The table is in {output.resolve()}")
 
 
