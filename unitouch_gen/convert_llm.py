@@ -52,9 +52,10 @@ def read_touch_llm(
     model: Any
     with reading("llama", folder):
         config = LlamaConfig.from_pretrained(folder, attention_bias=True, mlp_bias=True)  # which a LLaMA has not
-        model, loaded = LlamaForCausalLM.from_pretrained(
+        read: Any = LlamaForCausalLM.from_pretrained(
             folder, config=config, dtype=dtype, use_safetensors=True, output_loading_info=True
         )
+        model, loaded = read
         lacking = sorted(key for key in loaded["missing_keys"] if not key.endswith(".bias"))
         if lacking:
             raise InvalidInputError(f"it lacks {len(lacking)} tensors, such as {lacking[0]}; fetch it again.")
