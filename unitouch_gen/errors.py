@@ -6,9 +6,10 @@ names the argument, what came, and what to do.
 
 import math
 import os
+import re
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
@@ -40,12 +41,14 @@ class UnfamiliarInputWarning(UserWarning):
     """A touch is unlike those that the model knows, so what is made of it is a guess."""
 
 
-def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
+def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **options: Any) -> Any:
     """Runs a typer application under a name; `words` are a command line in place of the process's own.
 
     A user's mistake is one line on standard error and exit code 2, a warning of ours one line.
     """
     import typer
+
+    words = [expand_home(word) for word in (sys.argv[1:] if words is None else words)]
 
     def say(message: Any, *place: Any) -> None:
         print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
@@ -57,7 +60,7 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
             warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
             warnings.simplefilter("always", UnfamiliarInputWarning)
             warnings.showwarning = say  # type: ignore[assignment]
-            code = app(*words, standalone_mode=False, **options)
+            code = app(words, standalone_mode=False, **options)
         if code == 130:  # interrupted
             say("stopped; what is written is whole.")
         return code
@@ -66,6 +69,12 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
         if message:  # empty where the help has been shown instead
             say(message)
     sys.exit(2)
+
+
+def expand_home(word: str) -> str:
+    """A word of a command line with the home folder for `~`, which shells leave as it is in `--output=~/pictures`."""
+    option, value = re.fullmatch(r"(--[\w-]+=)?(.*)", word, flags=re.DOTALL).groups(default="")  # type: ignore[union-attr]
+    return option + (os.path.expanduser(value) if re.match(r"~[/\\]", value) else value)
 
 
 def describe(value: Any) -> str:

@@ -110,6 +110,14 @@ def test_help_and_mistyped_names_do_not_wait_for_torch(here):
     assert ended.stdout.count("False\n") == 3 and ended.stderr.count("\n") == 2
 
 
+@pytest.mark.parametrize("words", [["-o", "~/made"], ["--output=~/made"]])
+def test_a_tilde_is_the_home_folder_also_where_the_shell_leaves_it(here, command, models, monkeypatch, words):
+    monkeypatch.setenv("HOME", str(here / "home"))
+    code, _, err = command("touch-to-image", "in/dark.png", *words, "--steps", "2", "--model", models["touch-to-image"])
+    assert code == 0, err
+    assert (here / "home" / "made" / "dark.png").is_file() and not (here / "~").exists()
+
+
 def test_an_interrupt_ends_with_130(here, models):
     touches, model = ["in/dark.png"] * 500, ["--model", models["touch-to-image"]]
     child = Child(commanded, "touch-to-image", *touches, "-o", "out", "--batch-size", "1", *model, folder=here)
