@@ -82,6 +82,16 @@ def test_items_that_fail_are_told_and_tried_again(here, run, files):
     assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "notes.png"]
 
 
+@pytest.mark.parametrize(("last", "kept"), [('{"mine": 2}', 2), ('{"mine": ', 1)])
+def test_a_manifest_without_an_end_of_line_loses_no_whole_line(here, run, last, kept):
+    """As editors and other programs leave one; half a line, as a full disk does, is left out."""
+    (here / "table.csv").write_text("touch\nin/dark.png\n")
+    (here / "out").mkdir()
+    (here / "out" / "manifest.jsonl").write_text('{"mine": 1}\n' + last)
+    assert run("table.csv")[0] == 0
+    assert [line.get("mine") for line in lines(here / "out")] == [*range(1, kept + 1), None]
+
+
 def test_lists_that_say_something_else_are_refused(here, run, refused, files):
     for table, words, said in (
         ("touch,promt\nin/dark.png,1\n", [], "Did you mean 'prompt'?"),

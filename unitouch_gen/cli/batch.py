@@ -13,7 +13,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_file, check_integer, first_line
-from unitouch_gen.files import files_below, read_table
+from unitouch_gen.files import files_below, read_table, write_file
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
@@ -54,8 +54,7 @@ def batch(
     pictures = pictures_of(rows, columns, folder, output)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
-    if manifest.exists() and not (lines := manifest.read_bytes()).endswith(b"\n"):  # of a disk that was full
-        manifest.write_bytes(lines[: lines.rfind(b"\n") + 1])
+    end_last_line(manifest)
 
     state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
     most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
@@ -84,6 +83,20 @@ def batch(
         options.note(*failed)
         echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
     raise Exit(1 if failed else 0)
+
+
+def end_last_line(manifest: Path) -> None:
+    """Ends the last line of a manifest that a full disk cut; one that is not a whole line of JSON is left out."""
+    content = manifest.read_bytes() if manifest.exists() else b""
+    if not content or content.endswith(b"\n"):
+        return
+    whole_lines, newline, last = content.rpartition(b"\n")
+    try:
+        json.loads(last)
+    except ValueError:
+        write_file("--output", manifest, whole_lines + newline)
+    else:
+        write_file("--output", manifest, content + b"\n")
 
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
