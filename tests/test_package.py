@@ -93,6 +93,8 @@ def test_data_files_are_installed():
         "training/recipes/touch.yaml", "weights/cards/stylization.jpg", "weights/family.json",
         "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
         "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
+        "world/collection/index.csv", "world/collection/sounds/wood__default_dig_choppy_1.flac",
+        "world/collection/surfaces/wood__polyhaven_worn_planks.height.webp",
     ):  # fmt: skip
         assert files("unitouch_gen").joinpath(name).is_file(), name
 

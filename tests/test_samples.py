@@ -17,8 +17,13 @@ from unitouch_gen.cli.loading import DRAWING
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
 
-NOT_RUN = {"assemble_family": "takes trained stages", "drawing": "draws for the others",
-           "render_inputs": "writes into the checkout", "watch": "needs a camera"}  # fmt: skip
+NOT_RUN = {
+    "assemble_family": "takes trained stages",
+    "build_collection": "takes raw surfaces",
+    "drawing": "draws for the others",
+    "render_inputs": "writes into the checkout",
+    "watch": "needs a camera",
+}
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3])

@@ -23,7 +23,6 @@ from unitouch_gen.training.data import Contacts, DrawnContacts, Source
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.weights import TOUCH_TO_TEXT
-from unitouch_gen.world import World
 from unitouch_gen.world.questions import TOPICS, answered
 
 PROMPT = "{question}\n"  # before an answer
@@ -77,7 +76,7 @@ def pairs_of(sources: Sequence[Source], splits: Sequence[Contacts]) -> list[Pair
     pairs = list[Pairs]()
     for source, split in zip(sources, splits, strict=True):
         if isinstance(source, DrawnContacts):
-            draws = World(source.seed).draw(*source.contacts("train"))
+            draws = source.world().draw(*source.contacts("train"))
             measured = split.attributes.mean(dim=1)
             asked = [answered(draws, measured, variant) for variant in range(VARIANTS)]
             pairs += [[pair for one in told for pair in one.values()] for told in zip(*asked, strict=True)]

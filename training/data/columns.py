@@ -80,6 +80,11 @@ def columns_of(
         if lacking or len(data) < 2:
             wrong = f"no {few(lacking)}" if lacking else "a single record, where two are the least"
             raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
+    if config.drawn is not None and config.drawn.colours_alone and "touch" in needs:
+        raise InvalidInputError(
+            "`data.drawn.colours_alone` is true, but this stage needs touches, and surfaces without heights feel flat; "
+            "leave it out."
+        )
     if config.touch_size not in (None, processor.image_size) and config.drawn is not None:
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
     return [

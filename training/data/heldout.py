@@ -16,7 +16,7 @@ from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, re
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
-from unitouch_gen.world import SAMPLE_RATE, World
+from unitouch_gen.world import SAMPLE_RATE
 from unitouch_gen.world.questions import TOPICS, asked_of
 
 FIRST_SEED = 1000  # of the worlds that models are held against: beyond those that recipes train on
@@ -40,7 +40,7 @@ def world_contacts(
         seen, labels=labels, classes=classes, sounds=sounds,
         relit=lambda: float_pixels(relit(cache, source, split, seen)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
-        asked=lambda: asked_of(World(source.seed).draw(*source.contacts(split)), seen.attributes[:, 0]),
+        asked=lambda: asked_of(source.world().draw(*source.contacts(split)), seen.attributes[:, 0]),
     )  # fmt: skip
 
 
@@ -88,11 +88,14 @@ Sets = Iterator[tuple[str, bool, int, Splits]]
 
 def of_world(
     cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sensors: Sequence[str], seeds: Sequence[int],
-    objects: int, *, grasps: bool = False,
+    objects: int, *, grasps: bool = False, scanned: float = 0.0,
 ) -> Sets:  # fmt: skip
-    """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
+    """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material.
+
+    A share of the objects is scanned: at 1, all, without the materials that have no scanned surfaces.
+    """
     for seed, sensor in product(seeds, (*sensors, None)):
-        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects)
+        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects, scanned=scanned)
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
         embed_all(model, processor, splits)
         yield sensor or "sensors drawn anew", sensor in model.config.sensors, source.seed, splits

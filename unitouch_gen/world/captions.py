@@ -60,20 +60,29 @@ def sentence(draws: Draws, row: int, variant: int) -> str:
     scale = float(draws.scale[row])
     fine = "fine" if scale < 0.85 else "coarse" if scale > 1.2 else ""
     said = [roughness, hardness, colour_name(draws.colour[row])]
-    said += [word for word in ("regular" if spec.regular else "irregular", fine) if word and next(chances) < 0.5]
+    scanned = bool(draws.surface[row] >= 0)
+    if not scanned:  # of a scan, only what is measured of it is said
+        said += [word for word in ("regular" if spec.regular else "irregular", fine) if word and next(chances) < 0.5]
     kept = [word for word in said if next(chances) < 0.75]
-    named = next(chances) < 0.6
-    if not named or next(chances) < 0.3:
+    named = next(chances) < 0.6 or scanned
+    if not scanned and (not named or next(chances) < 0.3):
         kept.append(one(spec.feel))
     noun = spec.name if named else one(NOUNS)
     if short and named:
         return one(BEGINNINGS) + noun
     tail = []
-    if spec.grained and next(chances) < 0.6:
+    if is_grained(draws, row) and next(chances) < 0.6:
         tail.append(direction_word(float(draws.angle[row])))
     if next(chances) < 0.7:
         tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))
     return ", ".join([one(BEGINNINGS) + " ".join([*kept, noun]), *tail])
+
+
+def is_grained(draws: Draws, row: int) -> bool:
+    """Whether a contact's relief has a direction: by its material, or as its scan has."""
+    if draws.surface[row] >= 0:
+        return bool(draws.grained[row])
+    return MATERIALS[int(draws.material[row])].grained
 
 
 def colour_name(rgb: Tensor) -> str:

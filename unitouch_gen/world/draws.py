@@ -21,6 +21,7 @@ from unitouch_gen.world.materials import MATERIALS
 
 OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)  # first numbers of the streams' names
 SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM = range(4, 7)
+SCAN_STREAM, CAMERA_STREAM, RECORDING_STREAM = range(7, 10)
 
 MODES = 14  # partials of each object's sound
 
@@ -51,6 +52,7 @@ class Draws(SimpleNamespace):
     """Numbers of N contacts, each a tensor with N as its first dimension.
 
     They are named `material`, `object` and `contact`, int64; `_draw_one` says what the others are and how they vary.
+    `surface` is the number of the scanned surface that an object shows, -1 for a drawn one; see `with_scans`.
     """
 
     def __len__(self) -> int:
@@ -74,7 +76,8 @@ def draw(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Draws
     names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
     rows = [_draw_one(seed, *name) for name in names]
     columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
-    return Draws(material=material, object=object_, contact=contact, **columns)
+    surface = torch.full_like(material, -1)
+    return Draws(material=material, object=object_, contact=contact, surface=surface, **columns)
 
 
 def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str, Any]:

@@ -27,6 +27,7 @@ class Material:
     friction: float  # Coulomb coefficient against a gel
     density: float  # kg/dm^3, of things made of it
     compliance: float  # 0 for rigid, 1 for as soft as the gel; those of objects lie around it
+    field: float  # side that scans of it are taken to have, mm: the median over objects
     roughness: float  # standard deviation of its relief at amplitude 1, mm: the median over objects
     regular: bool  # whether its relief repeats
     grained: bool  # whether its relief has a direction, that of its grain

@@ -61,14 +61,17 @@ def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[st
         roughness = captions.word_below(captions.ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
         hardness = captions.word_below(captions.HARDNESS_WORDS, float(draws.compliance[row]))
         grain = captions.direction_word(float(draws.angle[row]))
-        bumps = "regular" if spec.regular else "irregular"
+        felt = f"it feels {roughness}, {hardness} and {spec.feel[0]}, with "
+        felt += "regular bumps." if spec.regular else "irregular bumps."
+        if draws.surface[row] >= 0:  # of a scan, only what is measured of it is said
+            felt = f"it feels {roughness} and {hardness}."
         agreed = holds[row] != ("slip" in asked["grasp"])
         answers = {
             "caption": f"{sentences[row]}.",
             "material": f"it is {spec.name}." if measured["cover"][row] >= UNTOLD else "that cannot be told.",
-            "feel": f"it feels {roughness}, {hardness} and {spec.feel[0]}, with {bumps} bumps.",
+            "feel": felt,
             "place": place_answer(*(measured[name][row] for name in ("cover", "place x", "place y"))),
-            "grain": f"it is {grain}." if spec.grained else "it has no grain.",
+            "grain": f"it is {grain}." if captions.is_grained(draws, row) else "it has no grain.",
             "grasp": f"{'yes' if agreed else 'no'}, it would {'hold' if holds[row] else 'slip'}.",
         }
         found.append({topic: (question, answers[topic]) for topic, question in asked.items()})

@@ -10,13 +10,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts, describe
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_texts,
+    describe,
+)
 from unitouch_gen.world.attributes import contact_attributes
+from unitouch_gen.world.cameras import photographed
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
+from unitouch_gen.world.scans import scanned_surfaces, with_scans
 from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
 from unitouch_gen.world.surfaces import pictures, surfaces
@@ -33,6 +43,7 @@ class Scene:
     material: Tensor  # names of the N contacts, int64 (N,)
     object: Tensor
     contact: Tensor
+    surface: list[str | None] = field(default_factory=list)  # names of scanned surfaces; `None` where objects are drawn
     image: Tensor | None = None  # pictures in [0, 1], (N, 3, S, S)
     touch: dict[str, Tensor] = field(default_factory=dict)  # by sensor, touch images in [0, 1], (N, 3, S, S)
     depth: dict[str, Tensor] = field(default_factory=dict)  # by sensor, displacement of the gel in view, mm, (N, S, S)
@@ -49,6 +60,10 @@ class World:
     Args:
         seed: Names the whole world; other seeds have other objects.
         image_size: Side of pictures and touch images, pixels.
+        scanned: Share of objects that show a scanned surface in place of a drawn one, where their material has some.
+            At 1, all of these do. Objects to train on show other surfaces than those held out.
+        photographic: Share of pictures that are taken as people take photos: see `photographed`.
+        colours_alone: Whether surfaces of which only colours are known are among the scanned. They feel flat.
 
     Raises:
         InvalidInputError, InvalidTypeError: On a number out of range.
@@ -59,8 +74,16 @@ class World:
         (torch.Size([2, 3, 128, 128]), True)
     """
 
-    def __init__(self, seed: int = 0, *, image_size: int = 128):
+    take = 0  # another number takes other photos of the same contacts
+
+    def __init__(
+        self, seed: int = 0, *, image_size: int = 128, scanned: float = 0.0, photographic: float = 0.0,
+        colours_alone: bool = False,
+    ):  # fmt: skip
         self.seed = check_integer("seed", seed, 0)
+        self.scanned = check_number("scanned", scanned, 0.0, 1.0)
+        self.photographic = check_number("photographic", photographic, 0.0, 1.0)
+        self.colours_alone = check_kind("colours_alone", colours_alone, bool)
         self.image_size = check_integer("image_size", image_size, 1, 4096)
         # Pixels a side of surfaces: a multiple of the picture's, twice as many at least.
         self.resolution = image_size * max(2, math.ceil(BASE_RESOLUTION / image_size))
@@ -89,7 +112,9 @@ class World:
         asked = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
         by, material = _sensors(sensors), _numbers("material", material, most=len(MATERIALS) - 1)
         object, contact = _numbers("object", object, len(material)), _numbers("contact", contact, len(material))
-        draws, scene = self.draw(material, object, contact), Scene(material, object, contact)
+        draws = self.draw(material, object, contact)
+        names = [scanned_surfaces()[number].name if number >= 0 else None for number in draws.surface.tolist()]
+        scene = Scene(material, object, contact, names)
         scene.left_out = [name for name in MODALITIES if name not in asked]
 
         # 2. Surfaces and their pictures.
@@ -104,6 +129,8 @@ class World:
             scene.left_out.append("surfaces")
         if coloured:
             scene.image = pictures(built, draws.light, draws.gloss, draws.white, draws.camera, size)
+            if self.photographic:
+                scene.image = photographed(self.seed, draws.names(), scene.image, self.photographic, self.take)
 
         # 3. Gels.
         for sensor in by if asked & {"touch", "depth", "attributes"} else ():
@@ -131,7 +158,8 @@ class World:
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
         """Numbers of N contacts named by three int64 tensors (N,)."""
-        return draw(self.seed, material, object_, contact)
+        draws = draw(self.seed, material, object_, contact)
+        return with_scans(self.seed, draws, self.scanned, self.colours_alone) if self.scanned else draws
 
     def _noisy(self, images: Tensor, draws: Draws, sensor: Sensor) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""

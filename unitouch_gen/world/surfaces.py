@@ -11,6 +11,7 @@ from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
 from unitouch_gen.world.materials import MATERIALS, Material
 from unitouch_gen.world.reliefs import Fields, relief, turned
+from unitouch_gen.world.scans import scanned_patches
 
 DEEPEST_GROUND = -8.0  # height of what lies behind a body, mm
 GAMMA = 1.8  # of the pictures: like the weights of their light chosen for materials to look apart, not measured
@@ -39,8 +40,14 @@ def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True)
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
     raised = torch.zeros(len(draws), resolution, resolution)
     albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
-    for index in draws.material.unique().tolist():
-        material, rows = MATERIALS[index], torch.nonzero(draws.material == index)[:, 0]
+    drawn = draws.surface < 0
+    if not drawn.all():
+        rows = torch.nonzero(~drawn)[:, 0]
+        raised[rows], colours = scanned_patches(draws, rows, resolution, coloured=coloured)
+        if albedo is not None:
+            albedo[rows] = colours
+    for index in draws.material[drawn].unique().tolist():
+        material, rows = MATERIALS[index], torch.nonzero(drawn & (draws.material == index))[:, 0]
         raised[rows], shade = relief(material.name, Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)

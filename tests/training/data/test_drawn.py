@@ -100,3 +100,30 @@ def test_other_sizes_and_sounds_are_rendered_anew(splits, place: Path, processor
         DataConfig(drawn=CONFIG.drawn, sets=[{"path": str(place)}]).sources()
     with pytest.raises(InvalidInputError, match="`touch_size` is 64; with drawn sensors"):
         columns_of(SOURCES[:1], place, CONFIG.model_copy(update={"touch_size": 64}), processor, ())
+
+
+def test_scanned_objects_are_those_of_their_split_and_named(place: Path, processor: UniTouchProcessor) -> None:
+    config = DataConfig(drawn=DrawnConfig(sensors=["digit"], objects=2, contacts_per_object=1, scanned=0.5))
+    [source] = config.drawn.sources()
+    [seen] = columns_of([source], place, config, processor, ("image", "touch"))
+    names = source.contacts("train")
+    scene = World(0, image_size=32, scanned=0.5).render(*(part[:GROUP] for part in names), modalities=("image", "text"))
+    assert seen.text[:GROUP] == scene.text and source.surfaces("train")[:GROUP] == scene.surface
+    np.testing.assert_allclose(seen.image[:GROUP] / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
+    assert 5 < sum(name is not None for name in source.surfaces("train")) <= 17
+    every = replace(source, scanned=1.0, held_out=4)
+    held_out, shown = every.contacts("test"), every.surfaces("test")
+    assert None not in shown and len(shown) == 15 * 4 * 5 and not {*shown} & {*source.surfaces("train")}
+    assert len({*held_out[0].tolist()}) == 15
+    prints = [
+        replace(source, **changes).fingerprint("test") for changes in ({}, {"scanned": 0.0}, {"photographic": 1.0})
+    ]
+    assert len({*prints}) == 3
+
+
+def test_surfaces_without_heights_are_refused_where_touches_are_needed(
+    place: Path, processor: UniTouchProcessor
+) -> None:
+    config = DataConfig(drawn=DrawnConfig(objects=1, contacts_per_object=1, scanned=1.0, colours_alone=True))
+    with pytest.raises(InvalidInputError, match=r"`data.drawn.colours_alone` is true, but this stage needs touches"):
+        columns_of(config.sources(), place, config, processor, ("image", "touch"))
