@@ -49,6 +49,7 @@ class DrawnContacts:
     held_out: int = 16  # objects of the other splits
     scanned: float = 0.0  # these are arguments of `World`
     photographic: float = 0.0
+    recordings: float = 0.0
     colours_alone: bool = False
 
     @property
@@ -62,6 +63,7 @@ class DrawnContacts:
             image_size=size,
             scanned=self.scanned,
             photographic=self.photographic,
+            recordings=self.recordings,
             colours_alone=self.colours_alone,
         )
 
@@ -123,8 +125,8 @@ class DrawnContacts:
         asked = [self.number, self.sensor, self.objects, self.contacts_per_object, self.seed]
         # `None` stands where folders of scanned materials once did: what was cached then is found.
         digest = hashlib.sha256(json.dumps([split, *asked, None, self.held_out]).encode())
-        if self.scanned or self.photographic:
-            digest.update(json.dumps([self.scanned, self.photographic, self.colours_alone]).encode())
+        if self.scanned or self.photographic or self.recordings:
+            digest.update(json.dumps([self.scanned, self.photographic, self.recordings, self.colours_alone]).encode())
             digest.update((COLLECTION / "index.csv").read_bytes())
         scene, seen = next(self.scenes(split, 32))
         digest.update("\n".join(scene.text).encode())
@@ -142,6 +144,7 @@ class DrawnContacts:
             "contacts_per_object": self.contacts_per_object,
             "scanned": self.scanned,
             "photographic": self.photographic,
+            "recordings": self.recordings,
         }
 
 
@@ -158,6 +161,7 @@ class DrawnConfig(Settings):
     seed: NonNegativeInt = 0  # of the world
     scanned: Share = 0.0  # of the objects, where their material has scanned surfaces
     photographic: Share = 0.0  # of pictures, which are taken as people take photos
+    recordings: Share = 0.0  # of the sounds, which are recorded hits where their material has some
     colours_alone: bool = False  # whether scans without heights are among them: for stages that see no touch
 
     def sources(self) -> list[DrawnContacts]:

@@ -88,14 +88,16 @@ Sets = Iterator[tuple[str, bool, int, Splits]]
 
 def of_world(
     cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sensors: Sequence[str], seeds: Sequence[int],
-    objects: int, *, grasps: bool = False, scanned: float = 0.0,
+    objects: int, *, grasps: bool = False, scanned: float = 0.0, recordings: float = 0.0,
 ) -> Sets:  # fmt: skip
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material.
 
-    A share of the objects is scanned: at 1, all, without the materials that have no scanned surfaces.
+    Shares of the objects are scanned, and of the sounds recorded, as in `DrawnContacts`.
     """
     for seed, sensor in product(seeds, (*sensors, None)):
-        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects, scanned=scanned)
+        source = DrawnContacts(
+            0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects, scanned=scanned, recordings=recordings
+        )
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
         embed_all(model, processor, splits)
         yield sensor or "sensors drawn anew", sensor in model.config.sensors, source.seed, splits

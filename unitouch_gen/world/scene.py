@@ -25,6 +25,7 @@ from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
 from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.recordings import as_files, recording_of, with_recordings
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.scans import scanned_surfaces, with_scans
 from unitouch_gen.world.sensors import SENSORS, Sensor
@@ -48,6 +49,7 @@ class Scene:
     touch: dict[str, Tensor] = field(default_factory=dict)  # by sensor, touch images in [0, 1], (N, 3, S, S)
     depth: dict[str, Tensor] = field(default_factory=dict)  # by sensor, displacement of the gel in view, mm, (N, S, S)
     audio: Tensor | None = None  # impact sounds in [-1, 1] at 16 kHz, (N, T)
+    recording: list[str | None] = field(default_factory=list)  # names of recorded hits; `None` of synthesised sounds
     text: list[str] | None = None  # N captions
     grasp: Tensor | None = None  # force that two fingers carry over the object's weight, (N,): above 1 they lift it
     attributes: dict[str, Tensor] = field(default_factory=dict)  # by sensor, (N, 13); see `ATTRIBUTES`
@@ -63,6 +65,8 @@ class World:
         scanned: Share of objects that show a scanned surface in place of a drawn one, where their material has some.
             At 1, all of these do. Objects to train on show other surfaces than those held out.
         photographic: Share of pictures that are taken as people take photos: see `photographed`.
+        recordings: Share of sounds that are recorded hits in place of synthesised ones, where their material has some.
+            Above 0, all sounds are stored as files are, too: some clipped, some through a codec.
         colours_alone: Whether surfaces of which only colours are known are among the scanned. They feel flat.
 
     Raises:
@@ -78,11 +82,12 @@ class World:
 
     def __init__(
         self, seed: int = 0, *, image_size: int = 128, scanned: float = 0.0, photographic: float = 0.0,
-        colours_alone: bool = False,
+        recordings: float = 0.0, colours_alone: bool = False,
     ):  # fmt: skip
         self.seed = check_integer("seed", seed, 0)
         self.scanned = check_number("scanned", scanned, 0.0, 1.0)
         self.photographic = check_number("photographic", photographic, 0.0, 1.0)
+        self.recordings = check_number("recordings", recordings, 0.0, 1.0)
         self.colours_alone = check_kind("colours_alone", colours_alone, bool)
         self.image_size = check_integer("image_size", image_size, 1, 4096)
         # Pixels a side of surfaces: a multiple of the picture's, twice as many at least.
@@ -151,7 +156,9 @@ class World:
             share = touched.float().mean(dim=(-2, -1))
             scene.grasp = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
         if "audio" in asked:
-            scene.audio = recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
+            scene.audio = self._sounds(draws)
+            names = [recording_of(self.seed, name, self.recordings) for name in draws.names()]
+            scene.recording = [recording.name if recording else None for recording in names]
         if "text" in asked:
             scene.text = described(draws)
         return scene
@@ -160,6 +167,14 @@ class World:
         """Numbers of N contacts named by three int64 tensors (N,)."""
         draws = draw(self.seed, material, object_, contact)
         return with_scans(self.seed, draws, self.scanned, self.colours_alone) if self.scanned else draws
+
+    def _sounds(self, draws: Draws) -> Tensor:
+        """Sounds (N, T) through a microphone in a room."""
+        sounds = impact_sounds(self.seed, draws)
+        if not self.recordings:
+            return recorded(self.seed, draws.names(), sounds)
+        sounds = with_recordings(self.seed, draws, sounds, self.recordings)
+        return as_files(self.seed, draws.names(), recorded(self.seed, draws.names(), sounds))
 
     def _noisy(self, images: Tensor, draws: Draws, sensor: Sensor) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""
