@@ -5,8 +5,10 @@ python samples/render_inputs.py
 
 from pathlib import Path
 
+import numpy as np
 import soundfile
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter
 
 from drawing import flat_contacts
 from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Scene, World, draw_sensor
@@ -43,7 +45,25 @@ def contact(material: str, which: int, modality: str, sensor: str = "gelsight") 
     return WORLD.render(*name, modalities=(modality,), sensors=(known,))
 
 
+def coin(side: int = 256) -> Image.Image:
+    """A height map of 16 bits, 24 mm wide, from the ground (black) to letters and rim (white) of a coin."""
+    levels = Image.new("F", (side, side), 0.0)
+    draw = ImageDraw.Draw(levels)
+    draw.circle((side / 2, side / 2), 0.46 * side, fill=0.55)
+    draw.circle((side / 2, side / 2), 0.46 * side, outline=1.0, width=side // 22)
+    for turn in range(0, 360, 10):
+        x, y = (side / 2 + 0.365 * side * part(np.radians(turn)) for part in (np.cos, np.sin))
+        draw.circle((x, y), 0.012 * side, fill=0.85)
+    font = ImageFont.load_default(0.17 * side)
+    for text, place in (("UNI", 0.4), ("TOUCH", 0.58)):
+        draw.text((side / 2, place * side), text, fill=1.0, font=font, anchor="mm")
+    smooth = gaussian_filter(np.asarray(levels), 1.5)
+    return Image.fromarray((smooth * 65535).round().astype(np.uint16))
+
+
 def main() -> None:
+    (INPUTS / "heights").mkdir(exist_ok=True)
+    coin().save(INPUTS / "heights" / "coin.png", optimize=True)
     for folder in (INPUTS, INPUTS / "photos", INPUTS / "sounds"):
         folder.mkdir(exist_ok=True)
     for sensor, material, which in TOUCHES:

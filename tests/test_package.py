@@ -90,6 +90,7 @@ def test_an_address_that_is_none_is_refused():
 def test_data_files_are_installed():
     for name in (
         "py.typed", "examples/gelsight_brick.png", "examples/photos/wood.png", "examples/sounds/metal.wav",
+        "examples/heights/coin.png",
         "training/recipes/touch.yaml", "weights/cards/stylization.jpg", "weights/family.json",
         "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
         "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
@@ -101,7 +102,7 @@ def test_data_files_are_installed():
 
 def test_examples_go_by_what_they_are_of():
     """And no two touches are of one material, or one would hide the other."""
-    for modality in ("touch", "image", "audio"):
+    for modality in ("touch", "image", "audio", "height"):
         known = examples(modality)
         assert known and all(example(name, modality) == file for name, file in known.items())
     assert {example(name.rpartition("_")[2]) for name in examples()} == set(examples().values())

@@ -16,6 +16,7 @@ from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.numerics import stability, work_precision
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
+from unitouch_gen.cli.press import press
 from unitouch_gen.errors import run_commands
 
 commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
@@ -37,7 +38,7 @@ def options(
     """Generative pipelines between touch and image."""
 
 
-drawing = (touch_to_image, stylize, x_to_touch, batch, app)
+drawing = (touch_to_image, stylize, x_to_touch, press, batch, app)
 for function in (*drawing, ask, classify, distill, evaluate, work_precision, stability, doctor):
     commands.command()(function)
 commands.add_typer(convert, name="convert")

@@ -17,6 +17,8 @@ from unitouch_gen.weights import JOINT
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
+WANTED = {"audio": "a sound file", "height": "a height map"}  # by modality, for messages; else an image file
+
 DRAWING = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
 """The built-in pipelines that make images, and what they are given of a contact to be measured on."""
 
@@ -24,10 +26,10 @@ DRAWING = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization"
 
 
 def suffixes_of(modality: str) -> frozenset[str]:
-    """Suffixes of the files in a folder that are taken for "touch", "image" or "audio"."""
+    """Suffixes of the files in a folder that are taken for "touch", "image", "height" or "audio"."""
     from unitouch_gen.models.videos import VIDEOS
 
-    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES.union(VIDEOS)}[modality]
+    return {"audio": SOUNDS, "image": IMAGES, "height": IMAGES, "touch": IMAGES.union(VIDEOS)}[modality]
 
 
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
@@ -47,7 +49,7 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
             matches = glob.glob(str(Path(word).relative_to(folder)), root_dir=folder, recursive=True)
             files = files_in(name, word, folder, [folder / one for one in matches], suffixes_of(modality))
         else:
-            check_file(name, word, "a sound file" if modality == "audio" else "an image file")
+            check_file(name, word, WANTED.get(modality, "an image file"))
             files = [Path(word)]
         found += sorted(files, key=natural)
     return found

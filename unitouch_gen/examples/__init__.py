@@ -1,4 +1,4 @@
-"""Touches, photos and sounds of objects that the built-in models never saw, to try calls with.
+"""Touches, photos and sounds of objects that the built-in models never saw, and a height map, to try calls with.
 
 `samples/inputs` is a link to this folder, which `samples/render_inputs.py` renders.
 """
@@ -7,7 +7,12 @@ from pathlib import Path
 
 from unitouch_gen.errors import check_choice, check_kind
 
-FOLDERS = {"touch": ("", ".png"), "image": ("photos", ".png"), "audio": ("sounds", ".wav")}
+FOLDERS = {
+    "touch": ("", ".png"),
+    "image": ("photos", ".png"),
+    "audio": ("sounds", ".wav"),
+    "height": ("heights", ".png"),
+}
 """Where the files of each modality are, and their suffix."""
 
 
@@ -15,7 +20,7 @@ def examples(modality: str = "touch") -> dict[str, Path]:
     """The files of a modality by their names, such as "gelsight_brick".
 
     Args:
-        modality: "touch", "image" or "audio".
+        modality: "touch", "image", "audio" or "height", a map to press.
 
     Raises:
         InvalidInputError: If there is no such modality.
@@ -29,7 +34,7 @@ def example(name: str, modality: str = "touch") -> Path:
 
     Args:
         name: What it is of, such as "brick"; a touch also goes by its file's name, "gelsight_brick".
-        modality: "touch", "image" or "audio".
+        modality: "touch", "image", "audio" or "height", a map to press.
 
     Returns:
         The path of a file.

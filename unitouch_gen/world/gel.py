@@ -47,9 +47,13 @@ def gel_indentation(height: Tensor, depth: Tensor, sensor: Sensor, resolution: i
     Surfaces of heights (N, R, R), mm, are pushed by depths (N,), mm, beyond their first contact.
     """
     pixels, extent = gel_square(sensor, resolution)
-    height = resample_centre(height, extent, pixels)
+    return indentation_against(resample_centre(height, extent, pixels), depth, sensor, extent)
+
+
+def indentation_against(height: Tensor, depth: Tensor, sensor: Sensor, extent: float) -> Tensor:
+    """How far heights (N, P, P), mm, over a square of `extent` mm reach into a gel, pushed by depths (N,), mm."""
     if sensor.dome:
-        axis = pixel_axis(pixels, 2 * extent / sensor.field_of_view)
+        axis = pixel_axis(height.shape[-1], 2 * extent / sensor.field_of_view)
         height = height - sensor.dome * (axis[None, :] ** 2 + axis[:, None] ** 2)
     return (height - height.amax(dim=(-2, -1), keepdim=True) + depth[:, None, None]).clamp_min(0.0)
 

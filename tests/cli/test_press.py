@@ -1,0 +1,61 @@
+"""`unitouch-gen press`: what it writes, and what it refuses before anything is written."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unitouch_gen.examples import example
+from unitouch_gen.world import SENSORS, press
+
+
+def test_touches_and_depth_maps_are_the_librarys(command, here):
+    words = ("press", "example:coin", "--mm", 24, "--sensor", "digit", "--sensor", "gelsight", "--size", 64)
+    code, out, err = command(*words, "--at", "0,0", "--at", "8,-1.5", "--depth-maps", "-o", "out", "--json")
+    assert (code, err) == (0, "")
+    rows = json.loads(out)["pictures"]
+    assert [(row["sensor"], row["picture"].rpartition("-")[2]) for row in rows] == [
+        ("digit", "1.png"), ("digit", "2.png"), ("gelsight", "1.png"), ("gelsight", "2.png"),
+    ]  # fmt: skip
+    for row, name in ((1, "digit"), (3, "gelsight")):
+        made = press(example("coin", "height"), 24.0, name, at=[(0.0, 0.0), (8.0, -1.5)], image_size=64)
+        pixels = np.asarray(Image.open(rows[row]["picture"])) / 255
+        np.testing.assert_allclose(pixels, made.touch[1].permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+        image = Image.open(rows[row]["depth_map"])
+        depth = float(image.text["mm_per_level"]) * np.asarray(image)
+        np.testing.assert_allclose(depth, made.depth[1].clamp_min(0.0), atol=1e-4)
+        assert float(image.text["mm_per_pixel"]) == pytest.approx(SENSORS[name].field_of_view / 64, rel=1e-5)
+        assert rows[row]["deepest_mm"] == pytest.approx(depth.max(), abs=2e-4)
+
+
+def test_one_touch_may_be_named_and_all_sensors_asked_for(command, here):
+    assert command("press", "example:coin", "--mm", 24, "-o", "one.png")[0] == 0
+    assert Image.open("one.png").size == (128, 128)
+    code, out, _ = command("press", "example:coin", "--mm", 24, "--sensor", "all", "-o", "all")
+    assert code == 0 and "Touches are in" in out
+    assert {file.stem for file in (here / "all").iterdir()} == {f"coin-{name}" for name in SENSORS}
+
+
+def test_bad_calls_are_one_line_and_write_nothing(command, refused, files, here):
+    Image.new("L", (16, 16), 9).save("flat.png")
+    Image.new("L", (1, 1)).save("thin.png")
+    before = files(here)
+    for words, *said in (
+        (("flat.png", "-o", "out"), "`height flat.png` is flat"),
+        (("example:coin", "flat.png", "-o", "out"), "`height flat.png` is flat"),
+        (("thin.png", "-o", "out"), "1 x 1 pixels"),
+        (("in/dark.png", "-o", "out"), "is in colours; pass a grey height map"),
+        (("gone.png", "-o", "out"), "'gone.png', which does not exist; pass the path of a height map"),
+        (("example:coin", "--mm", "-3", "-o", "out"), "`mm` is -3"),
+        (("example:coin", "--mm", "wide", "-o", "out"), "--mm"),
+        (("example:coin", "--depth", "nan", "-o", "out"), "`depth` is nan"),
+        (("example:coin", "--sensor", "digt", "-o", "out"), "`--sensor` is 'digt'", "Did you mean 'digit'?"),
+        (("example:coin", "--at", "3", "-o", "out"), "`--at` is '3'; pass X,Y"),
+        (("example:coin", "--mm", "24", "--at", "40,0", "-o", "out"), "beside the map"),
+        (("example:coin", "--sensor", "all", "-o", "out.png"), "'out.png' for 4 pictures"),
+        (("example:coin", "-o", "flat.png"), "`--output` would replace 'flat.png'"),
+        (("flat.png", "--overwrite", "-o", "flat.png"), "a map would be replaced"),
+    ):
+        refused(command("press", *words), *said)
+        assert files(here) == before, words

@@ -1,0 +1,118 @@
+"""`unitouch-gen press`: touches of one's own height maps."""
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option, echo
+
+from unitouch_gen.cli import options
+from unitouch_gen.cli.loading import files_of
+from unitouch_gen.cli.options import SEVERAL
+from unitouch_gen.cli.pictures import save, unique
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import replacing
+
+MM_PER_LEVEL = 1e-4  # of depth maps: 65,535 levels reach 6.5 mm, which is more than any gel is thick
+
+
+def press(
+    height: Annotated[list[str], Argument(help=f"Height maps, where bright is high: {SEVERAL}.")],
+    output: options.Output,
+    mm: Annotated[float, Option(help="Width of each map, mm.")] = 30.0,
+    relief_mm: Annotated[float, Option(help="Height from black to white, mm; factor on float TIFF and .npy.")] = 1.0,
+    sensor: Annotated[list[str] | None, Option(help="Such as digit, the default, or all; repeatable.")] = None,
+    depth: Annotated[float, Option(help="How far the surface is pushed beyond first contact, mm.")] = 1.0,
+    at: Annotated[list[str] | None, Option(help="Place of a contact: X,Y in mm from the centre; repeatable.")] = None,
+    image_size: Annotated[int, Option("--image-size", "--size", help="Side of the images, pixels.")] = 128,
+    depth_maps: Annotated[bool, Option("--depth-maps", metavar="", help="Write depth maps, 16-bit PNG, too.")] = False,
+    seed: Annotated[int, Option(min=0, max=2**32, help="Seed of the camera's noise.")] = 0,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Makes touch images of height maps, by any sensor.
+
+    Floats are heights in mm; 8 and 16 bit images run from 0 to `--relief-mm`. Images are named after map, sensor and
+    contact. A depth map beside each says in its metadata how many mm a level and a pixel are.
+
+    Example: unitouch-gen press example:coin --mm 24 --sensor all -o touches/
+    """
+    files = files_of("height", height, "height")
+    places = [place_of(word) for word in at or ["0,0"]]
+
+    from unitouch_gen.world import SENSORS
+    from unitouch_gen.world import press as pressed
+    from unitouch_gen.world.press import check_relief, height_maps
+
+    names = list(SENSORS) if sensor and "all" in sensor else sensor or ["digit"]
+    names = list(dict.fromkeys(check_choice("--sensor", name, SENSORS) for name in names))
+    numbers = [f"-{number + 1}" if len(places) > 1 else "" for number in range(len(places))]
+    rows = [(file, name, number) for file in files for name in names for number in numbers]
+    targets = targets_of(output, unique([f"{file.stem}-{name}{number}" for file, name, number in rows]))
+    maps = [file.with_name(f"{file.stem}-depth.png") for file in targets] if depth_maps else []
+    if {os.path.realpath(file) for file in files} & {os.path.realpath(file) for file in [*targets, *maps]}:
+        raise InvalidInputError(f"`--output` is {str(output)!r}, where a map would be replaced; name another place.")
+    options.check_output([*targets, *maps], overwrite)
+
+    for file in files:  # a map that cannot be pressed should not end the work half done
+        height_maps(file, check_relief(relief_mm), name=f"height {file.name}")
+    made: list[dict[str, Any]] = []
+    for file in files:
+        for name in names:
+            done = pressed(file, mm, name, depth, relief_mm=relief_mm, at=places, image_size=image_size, seed=seed)
+            for touch, displacement in zip(done.touch, done.depth, strict=True):
+                target = targets[len(made)]
+                save(to_picture(touch), target)
+                row: dict[str, Any] = {"picture": str(target), "height": str(file), "sensor": name}
+                if depth_maps:
+                    row["depth_map"] = str(maps[len(made)])
+                    save_depth(displacement, maps[len(made)], done.field_of_view / image_size)
+                row["deepest_mm"] = round(float(displacement.max()), 4)
+                made.append(row)
+    if as_json:
+        echo(json.dumps({"pictures": made, "mm_per_level": MM_PER_LEVEL}))
+        return
+    columns = list(made[0])
+    options.print_table(columns, [[Path(str(row[name])).name for name in columns] for row in made])
+    echo(f"Touches are in {targets[0].resolve().parent}")
+
+
+def place_of(word: str) -> tuple[float, float]:
+    """A place, as an option gives it."""
+    try:
+        x, y = map(float, word.split(","))
+    except ValueError as error:
+        raise InvalidInputError(f"`--at` is {word!r}; pass X,Y in mm from the centre, such as 5,-3.") from error
+    return x, y
+
+
+def targets_of(output: Path, stems: list[str]) -> list[Path]:
+    """A file for each name: in a folder, or the one that is named."""
+    if not output.suffix or os.path.isdir(output):
+        return [output / f"{stem}.png" for stem in stems]
+    if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(stems) > 1:
+        wanted = "name a folder, or for one a .png, .jpg or .webp."
+        raise InvalidInputError(f"`--output` is {str(output)!r} for {len(stems)} pictures; {wanted}")
+    return [output]
+
+
+def to_picture(touch: Any) -> Any:
+    """A touch (3, S, S) in [0, 1] as a PIL image."""
+    from PIL import Image
+
+    return Image.fromarray((touch * 255).round().byte().permute(1, 2, 0).numpy())
+
+
+def save_depth(depth: Any, file: Path, pixel: float) -> None:
+    """Writes a depth map (S, S), mm, as PNG of 16 bits with its scale in text entries."""
+    import numpy as np
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    scale = PngInfo()
+    scale.add_text("mm_per_level", f"{MM_PER_LEVEL:g}")
+    scale.add_text("mm_per_pixel", f"{pixel:g}")
+    levels = (depth / MM_PER_LEVEL).round().clamp(0, 65535).numpy().astype(np.uint16)
+    with replacing("--output", file) as partial:
+        Image.fromarray(levels).save(partial, pnginfo=scale)
