@@ -31,7 +31,7 @@ def lines(folder: Path) -> list[dict]:
 def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
     """Of a table with semicolons and a mark in front, as spreadsheets write them."""
     (here / "in" / "table.CSV").write_text(
-        "\ufeffTouch;name;prompt;seed\ndark.png;walls/one;rough, brick;5\nbright.png;;wood;\n;;;\ndark.png;;;6\n"
+        "\ufeffTouch;name;prompt;seed\ndark.png;walls/one;rough, brick;5.0\nbright.png;;wood;\n;;;\ndark.png;;;6\n"
     )
     code, out, err = run("in/table.CSV", "--seed", 4, "--steps", 3, "--sensor", "digit", "--set", "strength=0.5")
     assert (code, err) == (0, "") and f"3 of 3 pictures are in {here / 'out'}" in out
@@ -97,6 +97,9 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         ("touch,promt\nin/dark.png,1\n", [], "Did you mean 'prompt'?"),
         ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
         ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
+        ("touch,seed\nin/dark.png,1.5\n", [], "`seed` is 1.5"),
+        ("touch,seed\nin/dark.png,nan\n", [], "`seed` is 'nan'"),
+        (f"touch,seed\nin/dark.png,{2**64}\n", [], f"`seed` is {2**64}"),
         ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
         ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`--set` is 'bogus'"),
         ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),

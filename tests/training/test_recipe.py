@@ -89,6 +89,8 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line() -> None:
         ("touch", "trainer.batch_size=null", r"`trainer\.batch_size` is None; it has to be a valid integer"),
         ("touch", "trainer.steps=0", r"`trainer\.steps` is 0; it has to be greater than 0"),
         ("touch", "trainer.mixed_precision=int8", r"`trainer\.mixed_precision` is 'int8'; it has to be 'no', "),
+        ("touch", f"trainer.seed={2**64}", rf"`trainer\.seed` is {2**64}; it has to be less than"),
+        ("touch", f"data.drawn.seed={2**64}", rf"`data\.drawn\.seed` is {2**64}; it has to be less than"),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
         ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
         ("unclip", "objective.caption_share=0.9", "In `objective`, `caption_share` and `empty_share` are more than 1"),

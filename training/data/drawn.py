@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
+from pydantic import AfterValidator, Field, PositiveInt
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
@@ -158,7 +158,7 @@ class DrawnConfig(Settings):
     sensors: Annotated[list[SensorName | None], Field(min_length=1)] = [None]
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
-    seed: NonNegativeInt = 0  # of the world
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of the world
     scanned: Share = 0.0  # of the objects, where their material has scanned surfaces
     photographic: Share = 0.0  # of pictures, which are taken as people take photos
     recordings: Share = 0.0  # of the sounds, which are recorded hits where their material has some

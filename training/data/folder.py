@@ -23,6 +23,7 @@ FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 COLUMNS = (*FRAMES, *TEXTS, "sound")
 SPLITS = ("train", "val", "test")
+UNKNOWN = ("", "-1", "-1.0", "nan")  # as labels; pandas writes integers and blanks as floats
 
 
 def read(folder: Path) -> Iterator[Record | str]:
@@ -48,7 +49,7 @@ def read_rows(folder: Path, table: Path) -> Iterator[Record]:
         known |= {"sound": str(folder / row["sound"])} if row.get("sound") else {}
         if known.get("split") not in (None, *SPLITS):
             raise InvalidInputError(f"{str(table)!r} has the split {known['split']!r}; there are {', '.join(SPLITS)}.")
-        labels = {name: text for name, text in row.items() if name not in COLUMNS and text not in ("", "-1")}
+        labels = {name: text for name, text in row.items() if name not in COLUMNS and text.lower() not in UNKNOWN}
         yield Record(**known, labels=labels)
 
 

@@ -160,7 +160,8 @@ def open_dataset(
             labels = {label: classes[label].index(name) for label, name in record.labels.items()}
             records[number] = replace(record, sensor=sensor or record.sensor, labels=labels)
         if names is not None:  # by their numbers, where they are numbers
-            numbers = [int(n) if n.isdecimal() else place for place, n in enumerate(classes.get("material", ()))]
+            digits = [name.removesuffix(".0") for name in classes.get("material", ())]  # 1.0, as pandas writes 1
+            numbers = [int(n) if n.isdecimal() else place for place, n in enumerate(digits)]
             if max(numbers, default=-1) >= len(names):
                 raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
             classes["material"] = tuple(names[number] for number in numbers)

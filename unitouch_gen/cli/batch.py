@@ -125,9 +125,16 @@ def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: 
     for name, row in zip(unique(names), rows, strict=True):
         own = {column: row[column] for column in COLUMNS if column in row}
         inputs = {column: str(folder.absolute() / cell) if column in FILES else cell for column, cell in own.items()}
-        seed = check_integer("seed", options.value_of(row["seed"]), 0, 2**32)
-        pictures.append(Picture(inputs, output / f"{name}.png", seed))
+        pictures.append(Picture(inputs, output / f"{name}.png", seed_of(row["seed"])))
     return pictures
+
+
+def seed_of(cell: str) -> int:
+    """The seed in a cell, also written as 1.0: pandas makes floats of a column of integers and blanks."""
+    value = options.value_of(cell)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return check_integer("seed", value, 0, options.MAX_SEED)
 
 
 def make(pipe: Any, call: list[Picture], settings: dict[str, Any]) -> list[tuple[Any, dict[str, Any]]]:

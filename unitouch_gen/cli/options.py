@@ -19,6 +19,8 @@ SETTABLE = (
 )  # fmt: skip
 """Arguments of pipelines' calls that are the same for all pictures of a call."""
 
+MAX_SEED = 2**32 - 1  # torch's generators of the CPU start from 32 bits: 2**32 would draw what 0 does
+
 FILE = {"exists": True, "dir_okay": False}
 A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns or example:NAME"
 
@@ -41,7 +43,7 @@ Tolerance = Annotated[float | None, Option(min=1e-5, max=1, help="Relative error
 Guidance = Annotated[float | None, Option("--guidance-scale", "--guidance", min=0, help="On above 1.")]
 Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: width=160, bridge=false.")]
 Images = Annotated[int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Of each input.")]
-Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
+Seed = Annotated[int, Option(min=0, max=MAX_SEED, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 
 # Models and data sets

@@ -8,6 +8,7 @@ from typing import Any
 import gradio
 import torch
 
+from unitouch_gen.cli.options import MAX_SEED
 from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
@@ -132,7 +133,9 @@ def solver_fields(pipe: Any) -> Fields:
             "tolerance": gradio.Number(None, label="Error of the latents, in place of steps", minimum=1e-3, maximum=1),
             "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
             "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
-            "seed": gradio.Number(0, precision=0, minimum=0, label="Seed; a new one each time if empty"),
+            "seed": gradio.Number(
+                0, precision=0, minimum=0, maximum=MAX_SEED, label="Seed; a new one each time if empty"
+            ),
         }
 
 

@@ -196,6 +196,15 @@ def test_a_layout_is_recognised_and_read(make: Callable, tmp_path: Path) -> None
     assert data.records[0].caption == captions.get(make)
 
 
+def test_integers_that_pandas_has_made_floats_are_labels_by_number(tmp_path: Path) -> None:
+    """Of a column of integers with blanks; -1 and nan are no labels."""
+    rows = ("touch,material", "a.png,2.0", "b.png,-1.0", "c.png,nan", "d.png,0.0", "e.png,")
+    write(tmp_path, {**{f"{name}.png": 0 for name in "abcde"}, "labels.csv": "\n".join(rows)})
+    data = open_dataset(tmp_path, materials=["wood", "glass", "brick"])
+    found = {record.id: data.classes["material"][record.labels["material"]] for record in data.records if record.labels}
+    assert found == {"a.png": "brick", "d.png": "wood"}
+
+
 @pytest.mark.parametrize("make", [table, tree])
 def test_files_that_are_not_read_are_named(make: Callable, tmp_path: Path) -> None:
     make(tmp_path)
