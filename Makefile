@@ -40,8 +40,8 @@ help:  ## list the targets
 
 venv: $(VENV)/.installed-dev  ## build .venv: the package (editable), its tests and linters
 
-demo: $(VENV)/.installed  ## turn the touches in samples/inputs into pictures (outputs/demo)
-	$(BIN)/unitouch-gen touch-to-image samples/inputs -o outputs/demo --overwrite
+demo: $(VENV)/.installed  ## turn the example touches into pictures (outputs/demo)
+	$(BIN)/unitouch-gen touch-to-image unitouch_gen/examples -o outputs/demo --overwrite
 
 test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)

@@ -6,21 +6,24 @@ import re
 import runpy
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import metadata, packages_distributions
+from importlib.metadata import distribution, metadata, packages_distributions
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from markdown_it import MarkdownIt
 
-import unitouch_gen
+import unitouch_gen.pipelines
+import unitouch_gen.training
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.examples import example, examples
 from unitouch_gen.training.stages import STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+TRACKED = CHECKOUT / "tracked.txt"
 pytestmark = pytest.mark.wheel
 
 
@@ -34,11 +37,32 @@ def run(words: Sequence[str], folder: Path) -> str:
 
 
 def test_every_module_imports():
-    modules = [module.name for module in pkgutil.walk_packages(unitouch_gen.__path__, "unitouch_gen.")]
+    packages = (unitouch_gen, unitouch_gen.pipelines, unitouch_gen.training)
+    found = (pkgutil.walk_packages(package.__path__, f"{package.__name__}.") for package in packages)
+    modules = {module.name for modules in found for module in modules}
     for module in modules:
         if not module.endswith("__main__"):  # runs a command
             import_module(module)
-    assert {"unitouch_gen.pipelines.tiny", "unitouch_gen.training.touch", "unitouch_gen.world.scene"} <= set(modules)
+    assert {"unitouch_gen.pipelines.tiny", "unitouch_gen.training.touch", "unitouch_gen.world.scene"} <= modules
+
+
+@pytest.mark.skipif(not TRACKED.is_file(), reason="`.ci/run` lists what git tracks for the wheel")
+def test_the_wheel_holds_every_file_of_the_package():
+    tracked = {re.sub("^(pipelines|training)/", r"unitouch_gen/\1/", line) for line in TRACKED.read_text().split()}
+    links = {"unitouch_gen/pipelines", "unitouch_gen/training"}
+    installed = {str(file) for file in distribution("unitouch_gen").files or () if file.parts[0] == "unitouch_gen"}
+    assert {file for file in installed if "__pycache__" not in file} == tracked - links
+
+
+@pytest.mark.skipif(not (CHECKOUT / "pipelines").is_dir(), reason="there is no checkout here")
+def test_the_build_names_every_package():
+    settings = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {"unitouch_gen": "unitouch_gen", **{folder: name for name, folder in settings["package-dir"].items()}}
+    found = set()
+    for folder, package in folders.items():
+        for file in (CHECKOUT / folder).rglob("__init__.py"):
+            found.add(".".join([package, *file.parent.relative_to(CHECKOUT / folder).parts]))
+    assert found == {*settings["packages"]}
 
 
 def test_nothing_else_is_installed_at_the_top_level():
@@ -91,13 +115,14 @@ def test_data_files_are_installed():
     for name in (
         "py.typed", "examples/gelsight_brick.png", "examples/photos/wood.png", "examples/sounds/metal.wav",
         "examples/heights/coin.png",
-        "training/recipes/touch.yaml", "weights/cards/stylization.jpg", "weights/family.json",
+        "weights/cards/stylization.jpg", "weights/family.json",
         "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
         "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
         "world/collection/index.csv", "world/collection/sounds/wood__default_dig_choppy_1.flac",
         "world/collection/surfaces/wood__polyhaven_worn_planks.height.webp",
     ):  # fmt: skip
         assert files("unitouch_gen").joinpath(name).is_file(), name
+    assert files("unitouch_gen.training").joinpath("recipes/touch.yaml").is_file()
 
 
 def test_examples_go_by_what_they_are_of():
@@ -112,7 +137,7 @@ def test_examples_go_by_what_they_are_of():
         example("brick", "smell")
 
 
-@pytest.mark.skipif(not (CHECKOUT / "pipelines").is_dir(), reason="there is no checkout here")
+@pytest.mark.skipif(not (CHECKOUT / "unitouch_gen" / "pipelines").is_dir(), reason="there is no clone with links here")
 def test_a_clone_imports_as_it_lies():
     """Even without site-packages, where an editable install would lend it what it lacks."""
     words = "import unitouch_gen, importlib.util as u; print(u.find_spec('unitouch_gen.pipelines').origin)"

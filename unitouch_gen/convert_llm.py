@@ -50,6 +50,7 @@ def read_touch_llm(
     tokenizer = read_tokenizer("llama", folder, AutoTokenizer)
     tensors = open_checkpoint("bridge", bridge)
     model: Any
+    loaded: Any
     with reading("llama", folder):
         config = LlamaConfig.from_pretrained(folder, attention_bias=True, mlp_bias=True)  # which a LLaMA has not
         read: Any = LlamaForCausalLM.from_pretrained(
