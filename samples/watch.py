@@ -3,7 +3,8 @@
 python samples/watch.py 0 --output outputs/watched    # the first camera, on Linux; Ctrl-C ends it
 python samples/watch.py press.mp4
 
-Leave the sensor alone for the first moment: the gel at rest is seen in the first frames.
+Leave the sensor alone for a moment: frames that are alike show the gel at rest. If it is pressed from the beginning,
+the gel is seen when it is let go, as it has less structure than a contact.
 """
 
 import argparse
@@ -18,9 +19,17 @@ from PIL import Image
 from torch import Tensor
 
 import unitouch_gen
-from unitouch_gen.models.videos import LEAST_CHANGE, change_of, read_video
+from unitouch_gen.models.videos import (
+    CLEARLY,
+    LEAST_CHANGE,
+    QUIET,
+    change_of,
+    is_blank,
+    read_video,
+    structure_of,
+    thumbnails,
+)
 
-REST = 5  # frames whose median is the gel at rest
 SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
 
 
@@ -42,37 +51,56 @@ def camera(number: str) -> Iterator[np.ndarray]:
             yield frame.to_ndarray(format="rgb24")
 
 
-def as_batch(frame: np.ndarray) -> Tensor:
-    return torch.from_numpy(frame.copy()).permute(2, 0, 1)[None]
-
-
 def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
-    """Contacts of a stream, each when it is as firm as it gets; and again if it gets firmer by a twentieth."""
-    numbered = enumerate(frames)
-    quiet = [as_batch(frame) for _, (_, frame) in zip(range(REST), numbered, strict=False)]
-    if len(quiet) < REST:
-        raise SystemExit("The stream ended before the gel was seen at rest.")
-    first = torch.cat(quiet)
-    rest = first.median(dim=0, keepdim=True).values
-    least = max(LEAST_CHANGE, 3.0 * change_of(first, rest).max().item())  # more where they are noisy
+    """Contacts of a stream, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
 
+    Frames that are black, green or repeated are left out.
+    """
+    rest: Tensor | None = None
+    least = LEAST_CHANGE
+    quiet: list[Tensor] = []  # thumbnails of the latest frames that are alike
     recent = deque[Contact](maxlen=3)
-    best, due, age = None, False, 0  # due: yet to be yielded; age: frames since it was as firm
-    for index, frame in numbered:
-        change = change_of(as_batch(frame), rest)
+    best: Contact | None = None
+    due = False  # whether the best is yet to be yielded
+    age = 0  # frames since it was as firm
+    previous: np.ndarray | None = None
+    for index, frame in enumerate(frames):
+        small = thumbnails(torch.from_numpy(frame.copy()).permute(2, 0, 1)[None])
+        if is_blank(small):
+            continue
+        alike = not quiet or change_of(small, quiet[0]).max() < LEAST_CHANGE
+        quiet = [*quiet, small][-QUIET:] if alike else [small]
+        if len(quiet) == QUIET:
+            still = torch.cat(quiet).median(dim=0, keepdim=True).values
+            if rest is None or CLEARLY * structure_of(still) < structure_of(rest):
+                rest = still
+                noise = change_of(torch.cat(quiet), rest).max().item()
+                least = max(LEAST_CHANGE, 3.0 * noise)
+                best = None  # what was judged by another one
+                due = False
+                recent.clear()
+        repeated = previous is not None and np.array_equal(frame, previous)
+        previous = frame
+        if rest is None or repeated:
+            continue
+        change = change_of(small, rest)
         let_go = change.max().item() < least
         if not let_go:
             recent.append(Contact(frame, index, change.mean().item()))
             middle = sorted(recent, key=lambda one: one.firmness)[len(recent) // 2]  # a broken frame is never it
             age += 1
             if len(recent) == 3 and (best is None or middle.firmness > (1.0 if due else 1.05) * best.firmness):
-                best, due, age = middle, True, 0
+                best = middle
+                due = True
+                age = 0
         if due and best is not None and (let_go or age >= SETTLED):
             yield best
             due = False
         if let_go:
             best = None
             recent.clear()
+    if rest is None:
+        raise SystemExit("The stream ended before the gel was seen at rest.")
     if due and best is not None:
         yield best
 

@@ -38,7 +38,7 @@ class NotConvergedError(ArithmeticError):
 
 
 class UnfamiliarInputWarning(UserWarning):
-    """A touch is unlike those that the model knows, so what is made of it is a guess."""
+    """A touch is unlike those that the model knows, or a recording may show none, so what is made of it is a guess."""
 
 
 def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **options: Any) -> Any:

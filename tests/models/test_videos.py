@@ -8,7 +8,7 @@ import torch
 
 from tests.helpers import recordings
 from tests.helpers.recordings import FIRMEST
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.videos import firmest, read_video
 
@@ -24,6 +24,57 @@ def test_the_firmest_frame_is_found_and_is_not_a_broken_one():
     images[1] = images[FIRMEST + 5] = np.full_like(images[0], 255)
     images[-3] = np.zeros_like(images[0])
     assert abs(place_of_firmest(images) % 40 - FIRMEST) <= 1
+
+
+def green(image: np.ndarray, top: int = 0) -> np.ndarray:
+    """A frame whose rows from `top` on are Y = U = V = 0 in RGB (ITU-R BT.601)."""
+    rows = np.arange(len(image))[:, None, None]
+    return np.where(rows < top, image, [0, 135, 0]).astype(np.uint8)
+
+
+def test_black_green_and_frozen_frames_are_no_contacts():
+    images = list(recordings.frames())
+    garbage = np.random.default_rng(1).integers(0, 256, images[0].shape, dtype=np.uint8)
+    black = np.zeros_like(garbage)
+    for before, after in (
+        ([black] * 6, []),
+        ([], [black] * 6),
+        ([green(images[0])] * 6, [green(images[0], top=24)] * 6),
+        ([garbage] * 9, []),
+        ([], [green(images[0], top=44), *[garbage] * 9]),
+    ):
+        found = place_of_firmest([*before, *images, *after]) - len(before)
+        assert abs(found - FIRMEST) <= 1
+
+
+def test_a_simulation_without_noise_is_not_frozen():
+    images = list(recordings.frames(noise=0.0))
+    held = [*images[:FIRMEST], *[images[FIRMEST]] * 10, *images[FIRMEST:]]
+    assert FIRMEST <= place_of_firmest(held) < FIRMEST + 10
+
+
+def test_the_gel_at_rest_is_found_wherever_it_is_in_a_recording():
+    images = list(recordings.frames())
+    rest, rise, held = images[:8], images[8:FIRMEST], list(recordings.frames(presses=6))[FIRMEST::40]
+    for order in ([held, rise[::-1], rest], [rest, rise, held], [held, rise[::-1], rest, rise, held]):
+        recording = [image for part in order for image in part]
+        assert np.abs(recording[place_of_firmest(recording)] - images[FIRMEST].astype(int)).mean() < 3
+
+
+def test_the_firmest_of_many_presses_is_found():
+    """Of more frames than are held in memory."""
+    strong = 2 * np.array(list(recordings.frames(noise=0.0)), dtype=int) - recordings.rest()
+    presses = [recordings.frames(presses=3), iter(strong.clip(0, 255).astype(np.uint8)), recordings.frames(presses=3)]
+    assert abs(place_of_firmest([image for part in presses for image in part]) - 120 - FIRMEST) <= 1
+
+
+def test_a_recording_that_does_not_tell_what_rests_is_named():
+    """Two looks of the same structure: one is brighter."""
+    rest = recordings.rest()
+    other = rest + np.uint8(20)
+    noise = np.random.default_rng(0).integers(0, 2, (12, *rest.shape), dtype=np.uint8)
+    with pytest.warns(UnfamiliarInputWarning, match=r"`touch` does not show which .* frame \d+.*\. Record the gel"):
+        firmest("touch", iter([*(noise[:6] + rest), *(noise[6:] + other)]))
 
 
 def test_a_video_is_its_frames_and_a_touch(tmp_path):
