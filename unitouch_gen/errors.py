@@ -98,7 +98,9 @@ def needed(module: str, extra: str = "train") -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise InvalidInputError(f"`{module}` is missing: pip install -c constraints.txt -e '.[{extra}]'") from error
+        missing = isinstance(error, ModuleNotFoundError) and error.name == module
+        why = "is missing" if missing else f"cannot be imported ({first_line(error)})"
+        raise InvalidInputError(f"`{module}` {why}: pip install -c constraints.txt -e '.[{extra}]'") from error
 
 
 def did_you_mean(value: Any, choices: Iterable[str]) -> str:
@@ -157,11 +159,25 @@ def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "
     raise InvalidInputError(f"`{name}` is {describe(value)}; {wanted}".strip())
 
 
+def is_lfs_pointer(path: str | os.PathLike) -> bool:
+    """Whether a file is a pointer of Git LFS, which stands for a file that was not fetched."""
+    start = b"version https://git-lfs.github.com/spec/"
+    with open(path, "rb") as stream:
+        return stream.read(len(start)) == start
+
+
 def check_file(name: str, path: str | os.PathLike, what: str) -> None:
-    """Raises `InvalidInputError` if there is no file of that path; `what` should be there, such as "an image file"."""
+    """Raises `InvalidInputError` if `what`, such as "an image file", cannot be opened there or is a Git LFS pointer."""
+    subject = f"`{name}` names {str(path)[:400]!r}, which"
     if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         why = "is a folder" if os.path.isdir(path) else "is no file" if os.path.exists(path) else "does not exist"
-        raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
+        raise InvalidInputError(f"{subject} {why}; pass the path of {what}.")
+    try:
+        pointer = is_lfs_pointer(path)
+    except OSError as error:
+        raise InvalidInputError(f"{subject} cannot be opened: {error.strerror}; pass the path of {what}.") from error
+    if pointer:
+        raise InvalidInputError(f"{subject} is a Git LFS pointer to {what}; run `git lfs pull` in its repository.")
 
 
 def check_unused(instead: str, **given: Any) -> None:

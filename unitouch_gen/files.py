@@ -9,6 +9,7 @@ import os
 import re
 import tempfile
 import threading
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -126,7 +127,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     given = {key: options[key] for key in known if options.get(key) is not None}
     try:
         return Path(snapshot_download(str(place), **{"ignore_patterns": NEVER_READ, **given}))
-    except (OSError, ValueError) as error:  # the second of what is no id
+    except (OSError, ValueError, ImportError) as error:  # the last two: of what is no id, of a proxy by SOCKS
         why = f"no folder here, and no repository that can be fetched: {first_line(error)}"
         raise InvalidInputError(f"`{name}` is {str(place)!r}, {why}") from error
 
@@ -136,13 +137,45 @@ def natural(path: str | Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
-def files_below(folder: Path, above: frozenset[str] = frozenset()) -> list[Path]:
-    """The files in a folder and those below, in natural order; also behind links, unless they lead back."""
-    above |= {os.path.realpath(folder)}
-    _, folders, names = next(os.walk(folder), ("", [], []))  # nothing of a folder that may not be read
-    inner = [path for name in sorted(folders, key=natural) if os.path.realpath(path := folder / name) not in above]
-    files = [file for name in sorted(names, key=natural) if os.path.isfile(file := folder / name)]
-    return [*files, *(file for path in inner for file in files_below(path, above))]
+def files_below(folder: Path) -> list[Path]:
+    """The files in a folder and those below, in natural order; also behind links, where each folder is entered once.
+
+    A folder that may not be read counts as empty. One that is there by its own name and behind a link goes by its own.
+    """
+    files: list[Path] = []
+    waiting = [folder]
+    links: list[Path] = []
+    entered = set[str]()
+    while waiting or links:
+        place = waiting.pop() if waiting else links.pop(0)
+        real = os.path.realpath(place)
+        if real in entered:
+            continue
+        entered.add(real)
+        with suppress(OSError), os.scandir(place) as entries:
+            for entry in entries:
+                path = place / entry.name
+                if os.path.isfile(path):
+                    files.append(path)
+                elif os.path.isdir(path):
+                    (links if entry.is_symlink() else waiting).append(path)
+    return sorted(files, key=natural)
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """The file of a name in a folder, also where the disk composes its letters in another way than a table does.
+
+    Tables hold composed letters (NFC); macOS and some archives leave decomposed ones (NFD) on disks.
+    """
+    found = folder
+    for part in Path(name).parts:
+        exact = found / part
+        if not os.path.lexists(exact) and os.path.isdir(found):
+            wanted = unicodedata.normalize("NFC", part)
+            same = (other for other in os.listdir(found) if unicodedata.normalize("NFC", other) == wanted)
+            exact = found / next(same, part)
+        found = exact
+    return found
 
 
 def is_hidden(path: Path) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageCms
+from PIL.PngImagePlugin import PngInfo
 from transformers import CLIPImageProcessorPil
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
@@ -172,6 +173,24 @@ def test_a_camera_held_sideways_is_turned_back(processor: UniTouchProcessor, tmp
         Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "turned.png", exif=exif)
         found = processor.raw_images(tmp_path / "turned.png")
         torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
+
+
+def test_a_png_with_much_compressed_text_is_read_as_it_looks(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Image tools keep their graphs of nodes in texts, which Pillow refuses to read beyond a megabyte."""
+    texts = PngInfo()
+    texts.add_itxt("workflow", "node " * 10**6, zip=True)
+    texts.add_text("prompt", "node " * 10**6, zip=True)
+    Image.fromarray(PICTURE).save(tmp_path / "graph.png", pnginfo=texts)
+    with pytest.raises(ValueError, match="too large"):
+        Image.open(tmp_path / "graph.png").load()
+    found = processor.raw_images(tmp_path / "graph.png")
+    torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
+
+
+def test_a_png_whose_exif_is_broken_is_read_as_it_is_stored(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    Image.fromarray(PICTURE).save(tmp_path / "broken.png", exif=b"Exif\0\0MM\0*\0\0\0\x08\xff\xff")
+    found = processor.raw_images(tmp_path / "broken.png")
+    torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
 
 
 # What is no picture ---------------------------------------------------------------------------------------------------

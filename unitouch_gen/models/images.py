@@ -3,20 +3,29 @@
 import io
 import os
 import warnings
-from contextlib import suppress
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_finite, describe, first_line
+from unitouch_gen.models.formats import content_kind
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
+
+PNG = b"\x89PNG\r\n\x1a\n"
+PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT")  # that pixels depend on
+PNG_TEXTS = (b"tEXt", b"zTXt", b"iTXt")
+ORIENTED_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # of older ImageMagick and of Adobe
+MOST_PROFILE = 2**26  # bytes of a colour profile
 
 
 def load_images(name: str, images: ImageInput) -> list[Tensor]:
@@ -40,10 +49,15 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
 
 def _load(name: str, image: Any) -> list[Tensor]:
+    subject = f"`{name}`"
     if isinstance(image, str | os.PathLike):
+        image = os.path.expanduser(image)
         check_file(name, image, "an image file")
-    if isinstance(image, str | os.PathLike | Image.Image):
-        image = _decoded(name, image)
+        subject = f"`{name}` names {image!r}, which"
+        image = _read(subject, image)
+    if isinstance(image, Image.Image):
+        _check_size(name, *image.size)  # before its pixels are decoded
+        image = _decoded(subject, image)
     if isinstance(image, np.ndarray):
         image = _channels_first(name, image)
     if isinstance(image, Tensor):
@@ -51,25 +65,74 @@ def _load(name: str, image: Any) -> list[Tensor]:
     raise InvalidTypeError(f"`{name}` is {describe(image)}; pass a path, PIL image, array (H, W, 3), tensor (3, H, W).")
 
 
-def _decoded(name: str, image: Any) -> np.ndarray:
-    """Pixels of a file or a PIL image: uint8 (H, W, 3), or float32 (H, W) if deep and grey; or a file's array."""
-    subject = f"`{name}`" if isinstance(image, Image.Image) else f"`{name}` names {str(image)!r}, which"
+def _read(subject: str, file: str) -> Image.Image | np.ndarray:
+    """The image in a file, yet to be decoded, or the array in a .npy file."""
+    with _reading_errors(subject):
+        content = Path(file).read_bytes()
+        if content.startswith(b"\x93NUMPY"):
+            return np.load(io.BytesIO(content), allow_pickle=False)
+        try:
+            return _open_png(content) if content.startswith(PNG) else Image.open(io.BytesIO(content))
+        except Image.UnidentifiedImageError as error:  # its text names a buffer in memory
+            raise ValueError(content_kind(content)) from error
+
+
+@contextmanager
+def _reading_errors(subject: str) -> Iterator[None]:
+    """Whatever Pillow's plugins raise on broken files becomes one error."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
-            if not isinstance(image, Image.Image):
-                content = Path(image).read_bytes()
-                if content.startswith(b"\x93NUMPY"):
-                    return np.load(io.BytesIO(content), allow_pickle=False)
-                image = Image.open(io.BytesIO(content))
-        _check_size(name, *image.size)  # before its pixels are decoded
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked
+            warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # on broken EXIF
+            yield
+    except InvalidInputError:
+        raise
+    except Exception as error:
+        wanted = (
+            "a smaller one"
+            if isinstance(error, Image.DecompressionBombError)
+            else "a whole PNG, JPEG or other image file"
+        )
+        why = f"{subject} cannot be read as an image ({first_line(error)}); pass {wanted}."
+        raise InvalidInputError(why) from error
+
+
+def _open_png(content: bytes) -> Image.Image:
+    """A PNG without what is no part of the picture, such as texts, which Pillow refuses to read beyond 1 MB.
+
+    Image tools keep their graphs of nodes in texts. Two texts stay, in which some tools say how the image is turned.
+    """
+    kept = [PNG]
+    profile: bytes | None = None
+    place = len(PNG)
+    while place < len(content):
+        length = int.from_bytes(content[place : place + 4])
+        kind = content[place + 4 : place + 8]
+        data = content[place + 8 : place + 8 + length]
+        chunk = content[place : place + 12 + length]
+        place += len(chunk)
+        if kind == b"iCCP" and len(data) == length:
+            compressed = data.partition(b"\0")[2][1:]
+            with suppress(zlib.error):  # a broken profile is left out
+                profile = zlib.decompressobj().decompress(compressed, MOST_PROFILE)
+        elif kind in PNG_CHUNKS or (kind in PNG_TEXTS and data.partition(b"\0")[0] in ORIENTED_TEXTS):
+            kept.append(chunk)
+    image = Image.open(io.BytesIO(b"".join(kept)))
+    if profile:
+        image.info["icc_profile"] = profile
+    return image
+
+
+def _decoded(subject: str, image: Any) -> np.ndarray:
+    """Pixels of a PIL image: uint8 (H, W, 3), or float32 (H, W) if deep and grey."""
+    with _reading_errors(subject):
         if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
         tags = getattr(image, "tag_v2", {})  # of TIFF: bits, whether zero is white, whether it is stored by planes
         if tags.get(258, (8,))[0] > 8 and (tags.get(262) == 0 or tags.get(284) == 2):
             kind = "a TIFF of more than 8 bits, of planes or with white as zero"
             raise InvalidInputError(f"{subject} is {kind}, which Pillow misreads; save it as PNG.")
-        image = ImageOps.exif_transpose(image)
+        image = _upright(image)
         if image.mode == "F":
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
@@ -83,14 +146,17 @@ def _decoded(name: str, image: Any) -> np.ndarray:
             given, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
             image = ImageCms.profileToProfile(image, given, srgb, outputMode="RGB") if profile else image
         return np.array(image.convert("RGB"))
-    except InvalidInputError:
-        raise
-    except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
-        unknown = isinstance(error, Image.UnidentifiedImageError)  # its text names a buffer in memory
-        reason = "of no known format" if unknown else first_line(error)
-        raise InvalidInputError(
-            f"{subject} cannot be read as an image ({reason}); pass a whole PNG, JPEG or other image file."
-        ) from error
+
+
+def _upright(image: Any) -> Any:
+    """An image as its EXIF says to turn it; as it is stored where that is broken, as viewers show it."""
+    if image.format != "TIFF":  # whose tags these are
+        image.load()  # so what is raised below is about EXIF alone
+        try:
+            image.getexif().get(ExifTags.Base.Orientation)
+        except Exception:  # Pillow's reader raises errors of many kinds
+            return image
+    return ImageOps.exif_transpose(image)
 
 
 def _by_range(subject: str, values: np.ndarray) -> np.ndarray:

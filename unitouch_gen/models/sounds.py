@@ -17,6 +17,7 @@ from torch import Tensor
 from transformers.audio_utils import mel_filter_bank, spectrogram
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_integer, check_number, describe
+from unitouch_gen.models.formats import file_kind
 
 AudioInput = Any  # a path, samples with their rate, or a list of them
 
@@ -89,8 +90,9 @@ def _read(name: str, file: str | os.PathLike) -> tuple[np.ndarray, int]:
     try:
         samples, rate = soundfile.read(os.fsencode(file), dtype="float32", always_2d=True)
     except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
+        reason = f"which cannot be read as a sound ({file_kind(file)})"
         raise InvalidInputError(
-            f"`{name}` names {str(file)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
+            f"`{name}` names {str(file)!r}, {reason}; pass a wav, flac, ogg or mp3 file."
         ) from error
     return samples.T, rate
 

@@ -126,7 +126,7 @@ def firmest(name: str, source: str | os.PathLike | Iterator[ImageInput]) -> Tens
     if not candidates:
         wanted = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}; begin to record before you press.")
-    firmest_of_each = [frame for rest in candidates if (frame := _most_changed(contacts, rest))]
+    firmest_of_each = [one for rest in candidates if (one := _most_changed(contacts, rest)) is not None]
     if not firmest_of_each:
         wanted = "no frames differ from the gel at rest; press while it records"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
