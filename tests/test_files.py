@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, read_table, reading, replacing, write_file
+from unitouch_gen.files import check_writable, files_below, read_table, reading, replacing, write_file
 
 
 def names(folder: Path) -> set[str]:
@@ -28,6 +28,17 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
         partial.write_text("half")
         raise RuntimeError
     assert file.read_text() == "old" and names(tmp_path) == {"a.txt"}
+
+
+def test_files_below_are_listed_once_by_their_own_names_whatever_links_lead_back(tmp_path):
+    """Two loops of links, and a folder that is there by its own name and behind a link."""
+    for name in ("a/1.png", "a/10.png", "a/2.png", "b/c/3.png", "far/4.png"):
+        write_file("x", tmp_path / "in" / name, name)
+    (tmp_path / "in" / "far").rename(tmp_path / "far")
+    for link, target in (("a/up", ".."), ("b/up", ".."), ("a/0", "../b"), ("far", "../far")):
+        (tmp_path / "in" / link).symlink_to(target)
+    found = [str(file.relative_to(tmp_path / "in")) for file in files_below(tmp_path / "in")]
+    assert found == ["a/1.png", "a/2.png", "a/10.png", "b/c/3.png", "far/4.png"]
 
 
 def test_a_link_stays_one(tmp_path):

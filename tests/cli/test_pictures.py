@@ -97,6 +97,7 @@ def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
         ("in/*.png **/br*", ["10", "a[1]", "bright", "dark", "bright-2"]),
         ("in[7]/b* in[7]/*", ["bright", "9", "10", "a[1]", "bright-2", "dark"]),
         ("in/a[1].png in/press.mp4", ["a[1]", "press"]),
+        ("loop/**/*.png", ["bright", "dark"]),
         ("example:brick example:digit_wood", ["gelsight_brick", "digit_wood"]),
     ],
 )
@@ -107,6 +108,10 @@ def test_words_stand_for_files(here, run, words, stems):
         (here / "in" / name).touch()
     if "[7]" in words:
         (here / "in").rename("in[7]")
+    if "loop" in words:  # of links, two of which `glob` would not come out of
+        shutil.copytree("in", "loop/a", ignore=shutil.ignore_patterns("1*", "9*", "a*"))
+        for name in ("up", "top"):
+            (here / "loop" / "a" / name).symlink_to("..")
     if "press" in words:
         pytest.importorskip("av")
         recordings.write(here / "in" / "press.mp4", list(recordings.frames()))

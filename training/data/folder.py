@@ -4,6 +4,7 @@
     a.jpg, ...       named in the table
 
     train/wood/a.jpg, ...      or wood/a.jpg without splits, or a.jpg without materials
+    train/wood/plank/a.jpg     with a folder for each object of a material
     touch/..., picture/..., background/...      trees of the same names, with any endings; background.png is that of all
                                                 in its folder
 
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_table
+from unitouch_gen.files import find_file, read_table
 from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in
 
 LOOKS_LIKE = ()
@@ -23,6 +24,12 @@ FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 COLUMNS = (*FRAMES, *TEXTS, "sound")
 SPLITS = ("train", "val", "test")
+SPLIT_FOLDERS = {
+    **dict.fromkeys(("train", "training"), "train"),
+    **dict.fromkeys(("val", "valid", "validation", "dev"), "val"),
+    **dict.fromkeys(("test", "testing"), "test"),
+}
+"""Splits by names of folders, which may be in capitals."""
 UNKNOWN = ("", "-1", "-1.0", "nan")  # as labels; pandas writes integers and blanks as floats
 
 
@@ -32,6 +39,9 @@ def read(folder: Path) -> Iterator[Record | str]:
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     records = list(read_rows(folder, tables[0]) if tables else read_tree(folder))
+    if not records:
+        expected = "MATERIAL/x.png, MATERIAL/OBJECT/x.png, or these in train/, val/ and test/; or a table, labels.csv"
+        raise InvalidInputError(f"no touch is where one is expected, which is {expected}.")
     yield from records
     used = set(map(str, tables)).union(*(record.files for record in records))
     unread = [file.relative_to(folder).as_posix() for file in found(folder, "**/*") if str(file) not in used]
@@ -45,8 +55,8 @@ def read_rows(folder: Path, table: Path) -> Iterator[Record]:
     column_of(table, rows[0], ("touch",))
     for row in rows:
         known: dict[str, Any] = {"id": row["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
-        known |= {name: Frame(str(folder / row[name])) for name in FRAMES if row.get(name)}
-        known |= {"sound": str(folder / row["sound"])} if row.get("sound") else {}
+        known |= {name: Frame(str(find_file(folder, row[name]))) for name in FRAMES if row.get(name)}
+        known |= {"sound": str(find_file(folder, row["sound"]))} if row.get("sound") else {}
         if known.get("split") not in (None, *SPLITS):
             raise InvalidInputError(f"{str(table)!r} has the split {known['split']!r}; there are {', '.join(SPLITS)}.")
         labels = {name: text for name, text in row.items() if name not in COLUMNS and text.lower() not in UNKNOWN}
@@ -54,20 +64,38 @@ def read_rows(folder: Path, table: Path) -> Iterator[Record]:
 
 
 def read_tree(folder: Path) -> Iterator[Record]:
-    """The images in folders that are named by materials."""
+    """The images in folders that are named by materials, or by the objects of a material."""
     root = folder / "touch" if (folder / "touch").is_dir() else folder
-    parts = [root / part for part in SPLITS if (root / part).is_dir()] or [root]
-    pictures, backgrounds = (by_name(folder / tree) if root != folder else {} for tree in ("picture", "background"))
-    for place in [place for part in parts for place in (part, *filter(Path.is_dir, found(part, "*")))]:
-        general = next((Frame(str(image)) for image in images_in(place) if image.stem == "background"), None)
-        for image in images_in(place):
-            if image.stem == "background":
-                continue
-            name = image.relative_to(root)
-            picture, background = (tree.get(name.with_suffix("")) for tree in (pictures, backgrounds))
-            labels = {} if place in parts else {"material": place.name}
-            split = None if parts == [root] else name.parts[0]
-            yield Record(name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split)
+    trees = {tree: by_name(folder / tree) if root != folder else {} for tree in ("picture", "background")}
+    splits = {place: SPLIT_FOLDERS.get(place.name.casefold(), "") for place in folders_in(root)}
+    parts = sorted((place for place in splits if splits[place]), key=lambda place: SPLITS.index(splits[place]))
+    for part in parts or [root]:
+        split = splits.get(part)
+        yield from read_images(part, root, trees, split=split)
+        for material in folders_in(part):
+            labels = {"material": material.name}
+            yield from read_images(material, root, trees, split=split, labels=labels)
+            for item in folders_in(material):
+                name = f"{material.name}/{item.name}"
+                yield from read_images(item, root, trees, split=split, labels=labels, object=name)
+
+
+def read_images(place: Path, root: Path, trees: dict[str, dict[Path, Frame]], **known: Any) -> Iterator[Record]:
+    """The touches in one folder, with the pictures and backgrounds of the same names in other trees."""
+    images = images_in(place)
+    general = next((Frame(str(image)) for image in images if image.stem == "background"), None)
+    for image in images:
+        if image.stem == "background":
+            continue
+        name = image.relative_to(root)
+        picture = trees["picture"].get(name.with_suffix(""))
+        background = trees["background"].get(name.with_suffix("")) or general
+        yield Record(name.as_posix(), Frame(str(image)), picture, background, **known)
+
+
+def folders_in(place: Path) -> list[Path]:
+    """The folders in a folder, in natural order."""
+    return [path for path in found(place, "*") if path.is_dir()]
 
 
 def by_name(folder: Path) -> dict[Path, Frame]:

@@ -13,7 +13,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_file, check_integer, first_line
-from unitouch_gen.files import files_below, read_table, write_file
+from unitouch_gen.files import files_below, find_file, read_table, write_file
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
@@ -124,7 +124,8 @@ def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: 
             raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
     for name, row in zip(unique(names), rows, strict=True):
         own = {column: row[column] for column in COLUMNS if column in row}
-        inputs = {column: str(folder.absolute() / cell) if column in FILES else cell for column, cell in own.items()}
+        place = folder.absolute()
+        inputs = {column: str(find_file(place, cell)) if column in FILES else cell for column, cell in own.items()}
         pictures.append(Picture(inputs, output / f"{name}.png", seed_of(row["seed"])))
     return pictures
 

@@ -5,13 +5,23 @@ import logging
 import os
 import re
 from collections.abc import Collection, Iterable, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.cli.options import note
 from unitouch_gen.errors import InvalidInputError, check_dtype, check_file
 from unitouch_gen.examples import example
-from unitouch_gen.files import class_name, is_hidden, local_folder, natural, read_settings, reading
+from unitouch_gen.files import (
+    class_name,
+    files_below,
+    find_file,
+    is_hidden,
+    local_folder,
+    natural,
+    read_settings,
+    reading,
+)
 from unitouch_gen.weights import JOINT
 
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
@@ -46,13 +56,32 @@ def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
             files = files_in(name, word, Path(word), Path(word).iterdir(), suffixes_of(modality))
         elif not os.path.lexists(word) and re.search(r"[*?[]", word):
             folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))  # its brackets are a name's
-            matches = glob.glob(str(Path(word).relative_to(folder)), root_dir=folder, recursive=True)
-            files = files_in(name, word, folder, [folder / one for one in matches], suffixes_of(modality))
+            files = files_in(name, word, folder, files_like(folder, word), suffixes_of(modality))
         else:
-            check_file(name, word, WANTED.get(modality, "an image file"))
-            files = [Path(word)]
+            file = find_file(Path(), word)
+            check_file(name, file, WANTED.get(modality, "an image file"))
+            files = [file]
         found += sorted(files, key=natural)
     return found
+
+
+def files_like(folder: Path, pattern: str) -> list[Path]:
+    """The files below a folder that a pattern names, each once; `glob` would follow a loop of links forty times."""
+    wanted = Path(pattern).relative_to(folder).parts
+    if "**" in wanted:
+        paths = files_below(folder)
+    else:
+        paths = [folder / one for one in glob.glob(str(Path(*wanted)), root_dir=folder)]
+    return [path for path in paths if is_like(path.relative_to(folder).parts, wanted)]
+
+
+def is_like(parts: Sequence[str], pattern: Sequence[str]) -> bool:
+    """Whether the parts of a path are as those of a pattern; "**" stands for any number of folders."""
+    if not pattern:
+        return not parts
+    if pattern[0] == "**":
+        return is_like(parts, pattern[1:]) or (len(parts) > 0 and is_like(parts[1:], pattern))
+    return len(parts) > 0 and fnmatch(parts[0], pattern[0]) and is_like(parts[1:], pattern[1:])
 
 
 def files_in(name: str, place: str, folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:

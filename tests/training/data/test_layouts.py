@@ -1,6 +1,7 @@
 """Data sets as they are published, and folders of one's own: a small tree in each layout, and broken ones."""
 
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
@@ -132,6 +133,12 @@ def tree_of_splits(folder: Path) -> None:
     write(folder, {"train/wood/1.png": 0, "train/glass/1.PNG": 1, "test/wood/1.png": 2, "test/wood/.hidden.png": 3})
 
 
+def tree_of_objects(folder: Path) -> None:
+    write(
+        folder, {"Train/wood/plank/1.png": 1, "Train/wood/2.png": 2, "VALID/glass/jar/3.png": 3, "test/glass/4.png": 4}
+    )
+
+
 LAYOUTS: dict[Callable, tuple[int, str]] = {
     touch_and_go: (3, f"""
         {ONE}/0000000000.jpg 0 40 - gelsight - {ONE} train material=wood soft=hard rough=rough
@@ -181,6 +188,11 @@ LAYOUTS: dict[Callable, tuple[int, str]] = {
         train/glass/1.PNG 1 - - - - - train material=glass
         train/wood/1.png 0 - - - - - train material=wood
         test/wood/1.png 2 - - - - - test material=wood"""),
+    tree_of_objects: (4, """
+        Train/wood/2.png 2 - - - - - train material=wood
+        Train/wood/plank/1.png 1 - - - wood/plank - train material=wood
+        VALID/glass/jar/3.png 3 - - - glass/jar - val material=glass
+        test/glass/4.png 4 - - - - - test material=glass"""),
 }  # fmt: skip
 
 
@@ -188,12 +200,26 @@ LAYOUTS: dict[Callable, tuple[int, str]] = {
 def test_a_layout_is_recognised_and_read(make: Callable, tmp_path: Path) -> None:
     make(tmp_path)
     data = open_dataset(tmp_path)
-    assert data.kind == (make.__name__ if make not in (table, tree, tree_of_splits) else "folder")
+    assert data.kind == (make.__name__ if make not in (table, tree, tree_of_splits, tree_of_objects) else "folder")
     count, lines = LAYOUTS[make]
     expected = [line.strip() for line in lines.strip().splitlines()]
     assert len(data) == count and [line for line in told(data) if line in expected] == expected
     captions = {table: "rough, and hard", ssvtp: "smooth, number 1", hct: "soft, 0"}
     assert data.records[0].caption == captions.get(make)
+
+
+def test_a_table_names_files_however_their_letters_are_composed(tmp_path: Path) -> None:
+    """Composed in the table, decomposed on the disk, as macOS writes names."""
+    names = [unicodedata.normalize(form, "hölzchen/größe.png") for form in ("NFC", "NFD")]
+    assert names[0] != names[1]
+    write(tmp_path, {names[1]: 5, "labels.csv": f"touch,material\n{names[0]},wood"})
+    assert number_of(open_dataset(tmp_path).records[0].touch) == 5
+
+
+def test_a_folder_in_which_no_touch_is_where_one_is_expected_says_where(tmp_path: Path) -> None:
+    write(tmp_path, {"a/b/c/d/1.png": 1})
+    with pytest.raises(InvalidInputError, match=r"no touch is where one is expected, which is MATERIAL/x\.png"):
+        open_dataset(tmp_path)
 
 
 def test_integers_that_pandas_has_made_floats_are_labels_by_number(tmp_path: Path) -> None:
