@@ -30,6 +30,7 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
+    check_arguments,
     check_choice,
     check_dtype,
     check_integer,
@@ -39,7 +40,7 @@ from unitouch_gen.errors import (
     check_unused,
     describe,
 )
-from unitouch_gen.files import as_path, check_filled, check_saved, local_folder, reading
+from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
@@ -392,7 +393,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         Raises:
             InvalidInputError: If there is no such pipeline, or it cannot be read.
+            InvalidTypeError: If there is no such argument; diffusers would ignore it.
         """
+        components, defaults = cls._get_signature_keys(cls)
+        check_arguments("`from_pretrained`", kwargs, {*LOADING_OPTIONS, *components, *defaults})
         if kwargs.get("use_safetensors") is False:
             raise InvalidInputError("`use_safetensors` is False, but only safetensors are read; leave it out.")
         name, kwargs = "pretrained_model_name_or_path", {**kwargs, "use_safetensors": True}
@@ -465,7 +469,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         Raises:
             InvalidInputError: If no such weights can be read there, or they do not fit.
+            InvalidTypeError: If there is no such argument; diffusers would ignore it.
         """
+        own = ("adapter_name", "hotswap", "return_lora_metadata", "unet_config", "weight_name")
+        check_arguments("`load_lora_weights`", kwargs, {*LOADING_OPTIONS, *own})
         name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
         with nullcontext() if isinstance(place, dict) else reading(name, place):
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})

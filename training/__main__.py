@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from unitouch_gen.errors import run_commands
-from unitouch_gen.training.stages import Recipe, Stage, run_stage
+from unitouch_gen.training.stages import FOLDERS, Recipe, Stage, folders_of, run_stage
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
 
@@ -19,7 +19,10 @@ def add(name: str, sentence: str) -> None:
     def command(**options: Any) -> None:
         run_stage(name, **options)
 
-    command.__signature__ = signature(partial(Stage, name, Recipe))  # type: ignore[attr-defined]
+    options = signature(partial(Stage, name, Recipe))
+    unused = {*FOLDERS} - folders_of(name)
+    taken = [parameter for option, parameter in options.parameters.items() if option not in unused]
+    command.__signature__ = options.replace(parameters=taken)  # type: ignore[attr-defined]
     app.command(name, help=sentence)(command)
 
 

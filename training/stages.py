@@ -50,6 +50,9 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_va
 
 NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
 
+FOLDERS = ("joint", "vae", "llama", "init", "model")
+"""Options that name folders of models."""
+
 MODULES = {"touch_vae": "image_vae", "language_model": "touch_llm"}
 """Modules of stages that have none of their own."""
 
@@ -104,8 +107,7 @@ class Stage:
         self.batches: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
         folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        needs = {*NEEDS[name]}
-        if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
+        if not {*NEEDS[name]} <= {*self.folders} <= folders_of(name):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
             wanted = ", ".join(f"--{option} of {before}" for option, before in NEEDS[name].items()) or "none"
             raise InvalidInputError(f"{name} needs folders of models: {wanted}; it got {given}.")
@@ -226,6 +228,11 @@ def _difference(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]])
         if one != other:
             return f"{json.dumps(one) if one else 'nothing'} then, {json.dumps(other) if other else 'nothing'} now"
     return "nothing differs"
+
+
+def folders_of(name: str) -> set[str]:
+    """The options of a stage that name folders of models; all but `init` are needed."""
+    return {*NEEDS[name], *(["init"] if name in STARTING_FROM_WEIGHTS else [])}
 
 
 def weights_of(folder: Path) -> str:

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
@@ -109,6 +109,13 @@ def did_you_mean(value: Any, choices: Iterable[str]) -> str:
     # "huen" and "heun" have a ratio of 0.75; "gelslim" and "gelsight", two sensors, of 0.67.
     nearest = get_close_matches(str(value).casefold(), spelled, n=1, cutoff=0.75)
     return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
+
+
+def check_arguments(of: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raises if a name is no argument of a function that would ignore it; private names of libraries pass."""
+    for name in given:
+        if name not in known and not name.startswith("_"):
+            raise InvalidTypeError(f"`{name}` is no argument of {of}. {did_you_mean(name, known)}".strip())
 
 
 def check_kind(name: str, value: Any, *kinds: type) -> Any:

@@ -20,6 +20,34 @@ from unitouch_gen.errors import InvalidInputError, check_file, check_kind, descr
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
 
+LOADING_OPTIONS = (
+    "adapter_kwargs",
+    "allow_patterns",
+    "cache_dir",
+    "code_revision",
+    "device_map",
+    "disable_mmap",
+    "dtype",
+    "force_download",
+    "ignore_patterns",
+    "local_files_only",
+    "low_cpu_mem_usage",
+    "max_memory",
+    "offload_folder",
+    "offload_state_dict",
+    "proxies",
+    "quantization_config",
+    "revision",
+    "subfolder",
+    "token",
+    "torch_dtype",
+    "trust_remote_code",
+    "use_flashpack",
+    "use_safetensors",
+    "variant",
+)
+"""Options that diffusers and transformers pass to every `from_pretrained`, and those of downloads."""
+
 _LOADING = threading.RLock()  # libraries patch torch in all threads while they read networks
 
 

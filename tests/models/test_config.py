@@ -26,8 +26,10 @@ TRANSFORMER = [
     ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_size"),
     ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "patch_size"),
     ({"mlp_ratio": "4"}, "mlp_ratio"),
+    ({"hiden_size": 32}, "hiden_size"),
 ]
 JOINT_SPACE = [
+    ({"sensor": ["digit"]}, "sensor"),
     ({"sensor_tokens": 0}, "sensor_tokens"),
     ({"prototype_size": -1}, "prototype_size"),
     ({"temperature": 0.0}, "temperature"),

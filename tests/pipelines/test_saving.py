@@ -2,6 +2,7 @@
 
 import copy
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,10 @@ from torch.testing import assert_close
 
 from tests.helpers.calls import Call, quiet
 from tests.helpers.components import make_language_parts
+from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.pipelines import TouchToImagePipeline, TouchToTextPipeline
 
@@ -153,6 +156,20 @@ def test_a_language_model_that_is_not_filled_is_refused(tmp_path):
     save_file(state, file, metadata={"format": "pt"})
     with pytest.raises(InvalidInputError, match=r"language_model` holds \d+ of the \d+ numbers"):
         TouchToTextPipeline.from_pretrained(tmp_path)
+
+
+def test_misspelt_arguments_are_refused_with_the_one_that_was_meant(family, pipe):
+    """diffusers and transformers would ignore them."""
+    for call, name, meant in (
+        (partial(TouchToImagePipeline.from_pretrained, family), "dtpye", "dtype"),
+        (partial(TouchToImagePipeline.from_pretrained, family), "default_guidanc_scale", "default_guidance_scale"),
+        (partial(UniTouchModel.from_pretrained, family / "unitouch"), "modality", "modalities"),
+        (partial(UniTouchProcessor.from_pretrained, family / "processor"), "imagesize", "image_size"),
+        (partial(pipe.load_lora_weights, family), "weight_nmae", "weight_name"),
+        (partial(load_pipeline, "touch-to-image", model=None), "dtpye", "dtype"),
+    ):
+        with pytest.raises(InvalidTypeError, match=f"^`{name}` is no argument of .* Did you mean '{meant}'"):
+            call(**{name: None})
 
 
 def test_with_lora_loaded_nothing_is_saved_until_it_is_fused_or_unloaded(pipe, touch, tmp_path):

@@ -65,7 +65,8 @@ def batch(
     state.wait_for_everyone()  # or the last process would not miss what the first has made
     if device == "auto" and state.num_processes > 1:
         context.params["device"] = str(state.device)
-    pipe = load_pipeline(pipeline, quiet=options.is_quiet(False), **context.params) if calls else None
+    loading = options.model_options(context)
+    pipe = load_pipeline(pipeline, quiet=options.is_quiet(False), **loading) if calls else None
     output.mkdir(parents=True, exist_ok=True)
     with state.split_between_processes(calls) as mine:
         for call in tqdm(mine, unit="call", disable=None if state.is_main_process else True):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.cli.options import note
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_file
+from unitouch_gen.errors import InvalidInputError, check_arguments, check_dtype, check_file
 from unitouch_gen.examples import example
 from unitouch_gen.files import (
     class_name,
@@ -100,9 +100,10 @@ def files_in(name: str, place: str, folder: Path, paths: Iterable[Path], suffixe
 
 
 def load_pipeline(
-    name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu", quiet: bool = True, **_others: Any
+    name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu", quiet: bool = True, **unknown: Any
 ) -> Any:
     """A pipeline, by its built-in name and a command's options: of a folder or repository, or built in."""
+    check_arguments("`load_pipeline`", unknown, ("model", "dtype", "device", "quiet"))
     weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
     import transformers.utils.logging

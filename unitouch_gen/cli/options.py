@@ -64,6 +64,11 @@ def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
     return given
 
 
+def model_options(context: Context) -> dict[str, Any]:
+    """What a command was told of the model to load, and of where it runs."""
+    return {name: context.params[name] for name in ("model", "dtype", "device")}
+
+
 def value_of(word: str) -> Any:
     """A number, a list, true or false, as in JSON; any other word is a text."""
     try:

@@ -38,7 +38,8 @@ def touch_to_image(
     """
     touches = files_of("touch", touch, "touch")
     pictures = pictures_of([({"touch": file}, file.stem) for file in touches], context)
-    make(context, load_pipeline("touch-to-image", quiet=options.is_quiet(as_json), **context.params), pictures)
+    pipe = load_pipeline("touch-to-image", quiet=options.is_quiet(as_json), **options.model_options(context))
+    make(context, pipe, pictures)
 
 
 def stylize(
@@ -66,7 +67,8 @@ def stylize(
     touches = files_of("touch", touch, "touch")
     rows = [({"image": photo, "touch": file}, f"{photo.stem}-{file.stem}") for file in touches]
     pictures = pictures_of(rows, context)
-    make(context, load_pipeline("stylization", quiet=options.is_quiet(as_json), **context.params), pictures)
+    pipe = load_pipeline("stylization", quiet=options.is_quiet(as_json), **options.model_options(context))
+    make(context, pipe, pictures)
 
 
 def x_to_touch(
@@ -101,7 +103,7 @@ def x_to_touch(
     for name, values in inputs.items():
         if len(values) not in (1, most):
             raise InvalidInputError(f"`--{name}` was given {len(values)} times, another {most}; pass one, or as many.")
-    pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **context.params)
+    pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **options.model_options(context))
     known = list(pipe.config.sensors)
     drawn = known if sensor and "all" in sensor else sensor or ([] if background else known[:1])
     rows = list[tuple[dict[str, Any], str]]()

@@ -4,6 +4,7 @@ A value of a wrong type is an `InvalidTypeError`; one out of range, or that does
 `InvalidInputError`.
 """
 
+from collections.abc import Iterable
 from dataclasses import field
 from types import NoneType
 from typing import Any
@@ -12,7 +13,15 @@ from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number, check_texts
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_texts,
+    did_you_mean,
+)
 from unitouch_gen.saving import saved_whole
 
 
@@ -23,6 +32,14 @@ def check_halved(patch_size: int, *lengths: int) -> None:
             f"`patch_size` is {patch_size}; with a stem of convolutions it has to be a power of two that divides "
             "height, width and stride."
         )
+
+
+def check_spelling(kind: type, given: Iterable[str]) -> None:
+    """Refuses a misspelt field, which transformers would keep as an attribute that nothing reads."""
+    for name in given:
+        hint = did_you_mean(name, kind.__dataclass_fields__)  # type: ignore[attr-defined]
+        if hint and not hasattr(kind, name):
+            raise InvalidInputError(f"`{name}` is no setting of {kind.__name__}. {hint}")
 
 
 class UniTouchViTConfig(PreTrainedConfig):
@@ -61,6 +78,7 @@ class UniTouchViTConfig(PreTrainedConfig):
     patch_channels: int = 0
 
     def __post_init__(self, **kwargs: Any) -> None:
+        check_spelling(UniTouchViTConfig, kwargs)
         super().__post_init__(**kwargs)
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
                      "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
@@ -131,6 +149,7 @@ class UniTouchConfig(PreTrainedConfig):
 
     def __post_init__(self, **kwargs: Any) -> None:
         kwargs.pop("auto_map", None)  # of the folder
+        check_spelling(UniTouchConfig, kwargs)
         for name in self.sub_configs_defaults:
             check_kind(name, getattr(self, name), dict, PreTrainedConfig, NoneType)
         try:

@@ -16,8 +16,15 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
-from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_choice, check_dtype, check_file
-from unitouch_gen.files import local_folder, read_settings, reading
+from unitouch_gen.errors import (
+    InvalidInputError,
+    UnfamiliarInputWarning,
+    check_arguments,
+    check_choice,
+    check_dtype,
+    check_file,
+)
+from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, reading
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, local_mean, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
@@ -255,7 +262,9 @@ class UniTouchModel(PreTrainedModel):
 
         Raises:
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
+            InvalidTypeError: If there is no such argument.
         """
+        check_arguments("`from_pretrained`", kwargs, {*LOADING_OPTIONS, "modalities", "config"})
         name = "pretrained_model_name_or_path"
         dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder

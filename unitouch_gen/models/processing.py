@@ -13,8 +13,8 @@ from torch import Tensor
 from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_texts
-from unitouch_gen.files import check_saved, local_folder, reading
+from unitouch_gen.errors import InvalidInputError, check_arguments, check_integer, check_kind, check_texts
+from unitouch_gen.files import LOADING_OPTIONS, check_saved, local_folder, reading
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
 from unitouch_gen.models.videos import VIDEOS, firmest
@@ -133,7 +133,11 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def from_pretrained(  # type: ignore[override]
         cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
     ) -> "UniTouchProcessor":
-        """Reads what `save_pretrained` wrote, from its folder or from a repository."""
+        """Reads what `save_pretrained` wrote, from its folder or from a repository.
+
+        `kwargs` are options of a download, and `image_size` and `audio` in place of the stored ones.
+        """
+        check_arguments("`from_pretrained`", kwargs, {*LOADING_OPTIONS, "image_size", "audio"})
         name = "pretrained_model_name_or_path"
         settings = {"allow_patterns": ["*.json", "*.txt"], **kwargs}
         folder = local_folder(name, pretrained_model_name_or_path, **settings) / kwargs.pop("subfolder", "")
