@@ -85,6 +85,25 @@ def test_a_photo_is_restyled_and_what_is_missing_is_told(page):
     assert "steps" in make(page)
 
 
+def test_settings_that_are_opened_and_left_as_they_are_change_nothing(page):
+    upload(page, "Touch", str(example("brick")))
+    page.get_by_text("Solver, seed, number of pictures").locator("visible=true").click()
+    page.get_by_label("Seed; a new one each time if empty").locator("visible=true").wait_for()
+    assert "2 steps" in make(page)
+
+
+def test_stop_leaves_no_error(page):
+    upload(page, "Touch", str(example("brick")))
+    page.get_by_text("Solver, seed, number of pictures").locator("visible=true").click()
+    steps = page.get_by_label("number input for Steps").locator("visible=true")
+    steps.fill("50")
+    steps.blur()
+    page.get_by_role("button", name="Make it").locator("visible=true").click()
+    page.get_by_role("button", name="Stop").locator("visible=true").click()
+    page.get_by_text("Stopped.").or_(page.locator("img[src*='image.png']")).locator("visible=true").first.wait_for()
+    assert page.get_by_text("Error", exact=True).locator("visible=true").count() == 0
+
+
 def test_words_become_a_touch(page):
     page.get_by_role("tab", name="To touch").click()
     page.get_by_role("textbox", name="Words").fill("rough brick")

@@ -4,6 +4,7 @@ import os
 import resource
 import signal
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
 from multiprocessing import get_context
@@ -121,6 +122,13 @@ def command(*words: str) -> None:
 
     sys.argv = ["unitouch-gen", *words]
     main()
+
+
+def command_in(environment: dict[str, str], *words: str) -> None:
+    """`unitouch-gen ...` with some variables of the environment."""
+    os.environ.update(environment)
+    tempfile.tempdir = None  # so that TMPDIR is read again
+    command(*words)
 
 
 def script(code: str | Path, *words: str) -> None:

@@ -1,14 +1,17 @@
 """`unitouch-gen app`: a page in the browser, for this machine alone by default."""
 
 import os
+import signal
 import socket
 import tempfile
-from typing import Annotated, Any
+import time
+from contextlib import suppress
+from typing import Annotated
 
 import typer
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import kind_of, load_pipeline
+from unitouch_gen.cli.loading import folder_of, kind_of, load_pipeline
 from unitouch_gen.errors import InvalidInputError, needed
 
 
@@ -25,19 +28,57 @@ def app(
 
     Example: unitouch-gen app --port 7860
     """
-    try:
-        socket.create_server((host, port)).close()
-    except (OSError, UnicodeError) as error:
-        raise InvalidInputError(f"`--port` {port} cannot be served at {host!r}: {error}; name another.") from error
-    with tempfile.TemporaryDirectory(prefix="unitouch-") as folder:
-        os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
-        from unitouch_gen.pipelines.tiny import PIPELINES  # after that, as its libraries read it
+    host = host.strip("[]")  # of an IPv6 address as it stands in a URL
+    check_address(host, port)
+    interrupt_on_termination()
+    os.environ["HF_HUB_DISABLE_TELEMETRY"] = "1"
+    from unitouch_gen.pipelines.tiny import PIPELINES  # after that, as huggingface_hub reads it at import
 
-        models = {kind_of(one, PIPELINES): one for one in model} if model else dict.fromkeys(PIPELINES)
+    folders: dict[str, str | None] = dict.fromkeys(PIPELINES)
+    if model:
+        kinds = [kind_of(one, PIPELINES) for one in model]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise InvalidInputError(f"`--model` names {kinds.count(kind)} pipelines for {kind}; name one of each.")
+        folders = {kind: str(folder_of(one)) for kind, one in zip(kinds, model, strict=True)}
+    with tempfile.TemporaryDirectory(prefix="unitouch-") as uploads:
+        isolate_gradio(uploads)
         needed("gradio", "app")
-        from unitouch_gen.cli.page import launch
+        from unitouch_gen.cli.page import serving
 
-        shared: Any = {"dtype": dtype, "device": device}
-        page = launch({kind: load_pipeline(kind, model=one, **shared) for kind, one in models.items()}, host, port)
-        typer.echo(f"The page is at http://{host}:{port} (Ctrl-C ends it)")
-        page.block_thread()
+        pipes = {}
+        for kind, folder in folders.items():
+            pipes[kind] = load_pipeline(kind, model=folder, dtype=dtype, device=device)
+        with suppress(KeyboardInterrupt), serving(pipes, host, port) as page:
+            typer.echo(f"The page is at {page.local_url} (Ctrl-C ends it)")
+            while page.is_running:
+                time.sleep(0.1)
+
+
+def check_address(host: str, port: int) -> None:
+    """Raises if the port is taken or the host is none of this machine's, before anything is loaded."""
+    for name in (host, "127.0.0.1"):  # where gradio asks for the port as well
+        family = socket.AF_INET6 if ":" in name else socket.AF_INET
+        try:
+            socket.create_server((name, port), family=family).close()
+        except (OSError, UnicodeError) as error:
+            raise InvalidInputError(f"`--port` {port} cannot be served at {name!r}: {error}; name another.") from error
+
+
+def interrupt_on_termination() -> None:
+    """Has signals that end a process interrupt it as Ctrl-C does, so that uploads are removed."""
+    for name in ("SIGTERM", "SIGHUP"):  # sent by `docker stop` and systemd; by a terminal that closes
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
+            signal.signal(number, signal.default_int_handler)
+
+
+def isolate_gradio(uploads: str) -> None:
+    """Sets the environment that gradio reads: a folder for uploads, no statistics, no proxy and no other settings.
+
+    GRADIO_SHARE, GRADIO_ALLOWED_PATHS and the like would let in others or show them files. A proxy would be asked for
+    the page itself.
+    """
+    for name in [name for name in os.environ if name.startswith("GRADIO_") and name != "GRADIO_ROOT_PATH"]:
+        del os.environ[name]
+    os.environ.update(GRADIO_ANALYTICS_ENABLED="False", GRADIO_TEMP_DIR=uploads, no_proxy="*")

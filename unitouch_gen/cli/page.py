@@ -1,49 +1,154 @@
 """The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
 
+import html
+import math
+import os
 import random
-from collections.abc import Mapping
-from pathlib import Path
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gradio
+import safehttpx
 import torch
+from gradio import processing_utils
+from gradio.utils import get_upload_folder
+from transformers import StoppingCriteriaList
 
 from unitouch_gen.cli.options import MAX_SEED
-from unitouch_gen.errors import first_line
+from unitouch_gen.errors import InvalidInputError, check_integer, check_number, first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
 from unitouch_gen.world.questions import TOPICS
 
+TITLES = {
+    "touch-to-image": "To picture",
+    "stylization": "Style a photo",
+    "x-to-touch": "To touch",
+    "touch-to-text": "Ask",
+}
+"""Titles of the tabs, by the names of the built-in pipelines."""
+
+# On phones, all tabs in one row.
+CSS = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"
+
+UPLOAD_BYTES = 20 * 2**20
+UPLOAD_SECONDS = 3600  # how long uploads and pictures stay on the disk
+
 Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
 
-def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
+class StoppedError(Exception):
+    """Ends a job whose user has pressed "Stop" or closed the page."""
+
+
+class Jobs:
+    """Events that stop the jobs of a page, by browser session and pipeline.
+
+    gradio's `cancels` lets a running function go on, and its page then shows an error.
+    """
+
+    def __init__(self) -> None:
+        self.stops: dict[tuple[str, str], threading.Event] = {}
+
+    def expect(self, session: str, kind: str) -> None:
+        """Notes that a job is asked for, so that it can be stopped while it waits in the queue."""
+        stop = self.stops.get((session, kind))
+        if stop is None or stop.is_set():
+            self.stops[session, kind] = threading.Event()
+
+    @contextmanager
+    def running(self, session: str, kind: str) -> Iterator[Callable[[], None]]:
+        """Runs a job; yields a check that raises `StoppedError` once it is stopped."""
+        stop = self.stops.setdefault((session, kind), threading.Event())
+
+        def check() -> None:
+            if stop.is_set():
+                raise StoppedError
+
+        try:
+            check()
+            yield check
+        finally:
+            if self.stops.get((session, kind)) is stop:
+                del self.stops[session, kind]
+
+    def stop(self, session: str, kind: str) -> None:
+        """Stops the job that runs or waits, if there is one."""
+        if stop := self.stops.get((session, kind)):
+            stop.set()
+
+    def close(self, session: str) -> None:
+        """Stops all jobs of a session, which is over."""
+        for key in [key for key in self.stops if key[0] == session]:
+            self.stops.pop(key).set()
+
+    def close_all(self) -> None:
+        for session, _ in list(self.stops):
+            self.close(session)
+
+
+@contextmanager
+def serving(pipes: Mapping[str, Any], host: str, port: int) -> Iterator[gradio.Blocks]:
     """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it asks no other host."""
-    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch",
-              "touch-to-text": "Ask"}  # fmt: skip
-    # Uploads and pictures stay on the disk for an hour.
-    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
+    fetch_nothing()
+    jobs = Jobs()
+    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(600, UPLOAD_SECONDS)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, touches of anything, and answers about touches.")
         with gradio.Tabs():
-            for kind in [kind for kind in titles if kind in pipes]:
-                with gradio.Tab(titles[kind]):
-                    tab(pipes[kind], kind)
-    system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
-    css = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"  # phones
-    page.queue(max_size=16, default_concurrency_limit=1).launch(
-        server_name=host, server_port=port, theme=system, css=css, max_file_size=20 * 2**20, footer_links=[],
-        show_error=True, quiet=True, prevent_thread_lock=True,
-    )  # fmt: skip
-    return page
+            for kind, title in TITLES.items():
+                if kind in pipes:
+                    with gradio.Tab(title):
+                        tab(pipes[kind], kind, jobs)
+
+        def close(request: gradio.Request) -> None:
+            jobs.close(str(request.session_hash))
+
+        page.unload(close)
+    page.queue(max_size=16, default_concurrency_limit=1)
+    page.launch(
+        server_name=f"[{host}]" if ":" in host else host,
+        server_port=port,
+        share=False,  # left out, it is True in hosted notebooks
+        run_history=False,  # which offers to save runs at Hugging Face
+        enable_monitoring=False,
+        max_file_size=UPLOAD_BYTES,
+        theme=gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]),
+        css=CSS,
+        footer_links=[],
+        quiet=True,
+        prevent_thread_lock=True,
+    )
+    try:
+        yield page
+    finally:
+        jobs.close_all()
+        page.close(verbose=False)
 
 
-def tab(pipe: Any, kind: str) -> None:
+def fetch_nothing() -> None:
+    """Has gradio refuse addresses in place of files, which it would fetch for whoever names them."""
+
+    async def refuse(hostname: str) -> str:
+        raise page_error("An address was passed; upload the file, as this page fetches nothing.")
+
+    safehttpx.async_validate_url = refuse  # asked before each fetch, but for the hosts of this list
+    processing_utils.PUBLIC_HOSTNAME_WHITELIST.clear()
+
+
+def tab(pipe: Any, kind: str, jobs: Jobs) -> None:
     """The tab of a pipeline."""
     asking = kind == "touch-to-text"
     with gradio.Row():
         with gradio.Column():
-            fields = FIELDS[kind](pipe) | ({} if asking else solver_fields(pipe))
-            button = gradio.Button("Ask" if asking else "Make it", variant="primary")
+            fields = FIELDS[kind](pipe)
+            if not asking:
+                fields |= solver_fields(pipe)
+            with gradio.Row():
+                button = gradio.Button("Ask" if asking else "Make it", variant="primary", scale=3)
+                stop_button = gradio.Button("Stop", scale=1)
         with gradio.Column():
             results: list[Any] = [
                 gradio.Textbox(label="Answer")
@@ -55,17 +160,61 @@ def tab(pipe: Any, kind: str) -> None:
             ]
     bar = gradio.Progress()
 
-    def run(given: dict[Any, Any], progress: gradio.Progress = bar) -> tuple[Any, ...]:
-        values = {name: given[part] for name, part in fields.items() if given[part] not in (None, "")}
-        try:
-            return answer(pipe, kind, values, progress)
-        except (ValueError, TypeError, ArithmeticError) as error:
-            message = first_line(error)
-            for value in values.values():  # uploads by their names
-                message = message.replace(value, Path(value).name) if isinstance(value, str) else message
-            raise gradio.Error(message, duration=None, print_exception=False) from error
+    def expect(request: gradio.Request) -> None:
+        jobs.expect(str(request.session_hash), kind)
 
-    button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
+    def run(given: dict[Any, Any], request: gradio.Request, progress: gradio.Progress = bar) -> Any:
+        try:
+            values = values_of(fields, given)
+            with jobs.running(str(request.session_hash), kind) as check:
+                return answer(pipe, kind, values, progress, check)
+        except StoppedError:
+            gradio.Info("Stopped.")
+            return [gradio.skip()] * len(results)
+        except (MemoryError, torch.OutOfMemoryError) as error:
+            raise page_error("There is not enough memory; ask for fewer pictures.") from error
+        except (ValueError, TypeError, ArithmeticError) as error:
+            raise page_error(first_line(error)) from error
+
+    def stop(request: gradio.Request) -> None:
+        jobs.stop(str(request.session_hash), kind)
+
+    button.click(expect, queue=False, api_visibility="private")
+    button.click(
+        run,
+        set(fields.values()),
+        results,
+        preprocess=False,  # gradio's own opens pictures, and its errors quote the server's paths
+        concurrency_id="pipelines",
+        api_visibility="private",
+    )
+    stop_button.click(stop, queue=False, api_visibility="private")
+
+
+def page_error(message: str) -> gradio.Error:
+    """An error that the page shows as one line, with uploads by their names; gradio reads messages as HTML."""
+    folder = repr(get_upload_folder())[1:-1]  # as it is quoted
+    message = re.sub(re.escape(folder) + r"[\\/]+[0-9a-f]{64}[\\/]+", "", message)
+    return gradio.Error(html.escape(message, quote=False), duration=None, print_exception=False)
+
+
+def values_of(fields: Fields, given: Mapping[Any, Any]) -> dict[str, Any]:
+    """Arguments of a call from what the browser sent: uploads as paths, numbers within their fields' bounds."""
+    values = {}
+    for name, part in fields.items():
+        value = given[part]
+        if value is None or value == "":
+            continue
+        if isinstance(part, gradio.Image | gradio.Audio):
+            value = value["path"]
+            if not os.path.isfile(value):
+                raise InvalidInputError(f"`{name}` was uploaded more than an hour ago and is deleted; upload it again.")
+        elif isinstance(part, gradio.Slider | gradio.Number):
+            low = -math.inf if part.minimum is None else part.minimum
+            high = math.inf if part.maximum is None else part.maximum
+            check_number(name, value, low, high)
+        values[name] = value
+    return values
 
 
 def touch_fields(pipe: Any) -> Fields:
@@ -107,8 +256,12 @@ def asking_fields(pipe: Any) -> Fields:
     }
 
 
-FIELDS = {"touch-to-image": touch_fields, "stylization": style_fields, "x-to-touch": any_fields,
-          "touch-to-text": asking_fields}  # fmt: skip
+FIELDS = {
+    "touch-to-image": touch_fields,
+    "stylization": style_fields,
+    "x-to-touch": any_fields,
+    "touch-to-text": asking_fields,
+}
 
 
 def upload(modality: str, label: str) -> Any:
@@ -130,7 +283,10 @@ def solver_fields(pipe: Any) -> Fields:
     with gradio.Accordion("Solver, seed, number of pictures", open=False):
         return {
             "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
-            "tolerance": gradio.Number(None, label="Error of the latents, in place of steps", minimum=1e-3, maximum=1),
+            # Shown as 0 even if it has no value.
+            "tolerance": gradio.Number(
+                0, label="Error of the latents, in place of steps if above 0", minimum=0, maximum=1
+            ),
             "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
             "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
             "seed": gradio.Number(
@@ -139,21 +295,34 @@ def solver_fields(pipe: Any) -> Fields:
         }
 
 
-def answer(pipe: Any, kind: str, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
-    """Pictures or the answer, what the touch feels like, the run report and the seed."""
+def answer(
+    pipe: Any, kind: str, given: dict[str, Any], progress: gradio.Progress, check: Callable[[], None]
+) -> tuple[Any, ...]:
+    """Pictures or the answer, what the touch feels like, the run report and the seed.
+
+    `check` is called after each step and token, and may raise.
+    """
     if kind == "touch-to-text":
-        output = pipe(**given)
+
+        def go_on(tokens: torch.Tensor, scores: Any, **others: Any) -> torch.Tensor:
+            check()
+            return torch.zeros(len(tokens), dtype=torch.bool, device=tokens.device)
+
+        output = pipe(**given, stopping_criteria=StoppingCriteriaList([go_on]))
         return output.texts[0], "", str(output.report), ""
-    seed = int(given.pop("seed", random.randrange(2**31)))
-    if "tolerance" in given:
-        del given["num_inference_steps"]
+    seed = check_integer("seed", given.pop("seed", random.randrange(2**31)), 0)
+    unused = "num_inference_steps" if given.get("tolerance") else "tolerance"
+    given.pop(unused, None)
 
     def show(view: Any, step: int, timestep: Any, tensors: Any) -> dict[str, Any]:
+        check()
         progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
         return {}
 
-    generator = [torch.Generator().manual_seed(seed + number) for number in range(given["num_images_per_prompt"])]
-    output, felt = pipe(**given, generator=generator, callback_on_step_end=show), ""
+    count = check_integer("num_images_per_prompt", given.get("num_images_per_prompt", 1), 1)
+    generators = [torch.Generator().manual_seed(seed + number) for number in range(count)]
+    output = pipe(**given, generator=generators, callback_on_step_end=show)
+    felt = ""
     if kind == "touch-to-image" and "text" in pipe.unitouch.known_modalities and pipe.processor.tokenizer is not None:
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         felt = str(classifier(given["touch"], sensor=given.get("sensor"), top=3)[0])
