@@ -115,6 +115,17 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
         stage(runs, "image_text", "--resume", *changed, output="kept")  # without the weights that it started from
 
 
+def test_weights_behind_links_count_in_their_hash(tmp_path: Path) -> None:
+    for name, value in (("one", 1.0), ("other", 2.0)):
+        (tmp_path / f"weights-{name}").mkdir()
+        save_file({"a": torch.full((2,), value)}, tmp_path / f"weights-{name}" / "model.safetensors")
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "unitouch").symlink_to(tmp_path / f"weights-{name}")
+    assert weights_of(tmp_path / "one") != weights_of(tmp_path / "other")
+    shutil.copytree(tmp_path / "one", tmp_path / "copy")  # which follows the link
+    assert weights_of(tmp_path / "one") == weights_of(tmp_path / "copy")
+
+
 @pytest.fixture(scope="module")
 def family(runs: Path) -> Path:
     assemble(runs, runs / "family")
