@@ -55,6 +55,15 @@ def test_a_missing_extra_is_named():
         errors.needed("no_such_module")
 
 
+def test_an_extra_that_is_there_and_cannot_be_imported_is_not_called_missing(tmp_path, monkeypatch):
+    (tmp_path / "broken_extra.py").write_text("raise ImportError('Using SOCKS proxy, without its package.')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        InvalidInputError, match=r"`broken_extra` cannot be imported \(Using SOCKS proxy.*: pip install"
+    ):
+        errors.needed("broken_extra")
+
+
 @pytest.mark.parametrize("error", [InvalidInputError("a\nb"), NonFiniteError("a\nb"), typer.BadParameter("a\nb")])
 def test_a_mistake_is_one_line_and_exit_code_2(error, capsys):
     app = typer.Typer()

@@ -11,7 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
+import huggingface_hub
 import pytest
+import torch
 
 from tests.helpers import components
 from tests.helpers.processes import Child, command_in
@@ -105,7 +107,13 @@ def evaluations():
 
 
 @pytest.fixture(scope="module")
-def address(uploads, evaluations):
+def failures():
+    """Errors that the UNet raises next."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def address(uploads, evaluations, failures):
     """A page whose UNet takes 10 ms at least."""
     from unitouch_gen.cli.page import serving
 
@@ -115,6 +123,8 @@ def address(uploads, evaluations):
 
     def wait(*_):
         evaluations.append(1)
+        if failures:
+            raise failures.pop()
         time.sleep(0.01)
 
     pipe.unet.register_forward_pre_hook(wait)
@@ -208,6 +218,13 @@ def test_fields_that_are_emptied_have_their_defaults(visitor, touch):
     assert len(pictures) == 1 and "2 steps" in report and 0 <= int(seed) < 2**31 and "%" in felt
 
 
+def test_what_does_not_fit_into_memory_is_told_in_a_line(visitor, touch, failures, capfd):
+    failures.append(torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB."))
+    visitor.make(touch, Steps=2)
+    assert plain(visitor.refused(), "not enough memory", "fewer pictures")
+    assert capfd.readouterr().err == ""
+
+
 # Stops ----------------------------------------------------------------------------------------------------------------
 
 
@@ -296,7 +313,7 @@ def test_addresses_in_place_of_files_are_not_fetched(address, connected, capfd, 
     assert {host for host, *_ in connected} == {"127.0.0.1"}
 
 
-def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_up(here, models, tmp_path):
+def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_up(here, models, tmp_path, files):
     try:
         host, port = "::1", free_port("::1")
     except OSError:  # a machine without IPv6
@@ -316,6 +333,7 @@ def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_u
         "TMPDIR": str(tmp_path / "temporary"),
     }
     words = ["app", "--host", host, "--port", str(port), "--model", models["touch-to-image"]]
+    before = files(here)
     child = Child(command_in, environment, *words, folder=here)
     while not (child.notes / "out").exists() or "The page is at" not in child.out:
         assert child.process.is_alive(), child.err
@@ -331,7 +349,7 @@ def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_u
         os.kill(child.process.pid, signal.SIGTERM)  # as `docker stop` does
         assert child.wait() == 0, child.err
     assert child.out.count("\n") == 1 and child.err == ""  # no tunnel, no server of tools
-    assert list((tmp_path / "temporary").iterdir()) == []
+    assert list((tmp_path / "temporary").iterdir()) == [] and files(here) == before
 
 
 def test_addresses_that_cannot_be_served_are_refused_before_anything_is_read(command, refused):
@@ -345,3 +363,12 @@ def test_addresses_that_cannot_be_served_are_refused_before_anything_is_read(com
 def test_two_models_of_a_kind_are_refused(command, refused, models):
     model = models["touch-to-image"]
     refused(command("app", "--port", free_port(), "--model", model, "--model", model), "`--model`", "touch-to-image")
+
+
+def test_a_repository_behind_a_proxy_that_cannot_be_asked_is_refused(command, refused, monkeypatch):
+    monkeypatch.setenv("all_proxy", f"socks5://127.0.0.1:{free_port()}")
+    huggingface_hub.close_session()  # which keeps its proxies
+    try:
+        refused(command("app", "--port", free_port(), "--model", "someone/model"), "`--model` is 'someone/model'")
+    finally:
+        huggingface_hub.close_session()

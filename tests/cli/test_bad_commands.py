@@ -118,14 +118,16 @@ def test_a_tilde_is_the_home_folder_also_where_the_shell_leaves_it(here, command
     assert (here / "home" / "made" / "dark.png").is_file() and not (here / "~").exists()
 
 
-def test_an_interrupt_ends_with_130(here, models):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_an_interrupt_ends_with_130_and_leaves_no_temporary_folder(here, models, name):
     touches, model = ["in/dark.png"] * 500, ["--model", models["touch-to-image"]]
     child = Child(commanded, "touch-to-image", *touches, "-o", "out", "--batch-size", "1", *model, folder=here)
     while not list(here.glob("out/*.png")):
         assert child.process.is_alive(), child.err
         time.sleep(0.05)
-    os.kill(child.process.pid, signal.SIGINT)
-    assert child.wait() == 130 and child.err == "unitouch-gen: stopped; what is written is whole.\n"
+    os.kill(child.process.pid, getattr(signal, name))
+    assert child.wait() == 130 and list(here.glob("out/.*")) == []
+    assert child.err == "unitouch-gen: stopped; what is written is whole.\n"
 
 
 def found(command: Any = None, name: str = "unitouch-gen") -> Iterator[tuple[str, Any]]:

@@ -1,6 +1,8 @@
 """`unitouch-gen ...`: a thin layer over the pipelines. Each command imports what it needs when it runs."""
 
+import signal
 import sys
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -47,4 +49,14 @@ commands.add_typer(data, name="data")
 
 def main() -> None:
     """Entry point: turns users' mistakes into one line and exit code 2."""
+    with suppress(ValueError):  # signals are the main thread's
+        interrupt_on_termination()
     sys.exit(run_commands(commands, "unitouch-gen"))
+
+
+def interrupt_on_termination() -> None:
+    """Has signals that end a process interrupt it as Ctrl-C does, so that temporary folders are removed."""
+    for name in ("SIGTERM", "SIGHUP"):  # of `docker stop`, systemd and Slurm; of a terminal that closes
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
+            signal.signal(number, signal.default_int_handler)

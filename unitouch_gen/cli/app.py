@@ -1,7 +1,6 @@
 """`unitouch-gen app`: a page in the browser, for this machine alone by default."""
 
 import os
-import signal
 import socket
 import tempfile
 import time
@@ -30,7 +29,6 @@ def app(
     """
     host = host.strip("[]")  # of an IPv6 address as it stands in a URL
     check_address(host, port)
-    interrupt_on_termination()
     os.environ["HF_HUB_DISABLE_TELEMETRY"] = "1"
     from unitouch_gen.pipelines.tiny import PIPELINES  # after that, as huggingface_hub reads it at import
 
@@ -63,14 +61,6 @@ def check_address(host: str, port: int) -> None:
             socket.create_server((name, port), family=family).close()
         except (OSError, UnicodeError) as error:
             raise InvalidInputError(f"`--port` {port} cannot be served at {name!r}: {error}; name another.") from error
-
-
-def interrupt_on_termination() -> None:
-    """Has signals that end a process interrupt it as Ctrl-C does, so that uploads are removed."""
-    for name in ("SIGTERM", "SIGHUP"):  # sent by `docker stop` and systemd; by a terminal that closes
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
-            signal.signal(number, signal.default_int_handler)
 
 
 def isolate_gradio(uploads: str) -> None:
