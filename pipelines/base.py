@@ -169,8 +169,12 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
         check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
         scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_SCALE)
-        own = timesteps is None and (solver, tolerance, init_strength) == (None, None, 1.0)
-        usual = num_inference_steps in (None, self.config.default_num_inference_steps)
+        # The scheduler's own steps are kept unless an argument, which may be of any kind yet, asks for others.
+        whole = isinstance(init_strength, float | int) and init_strength == 1.0
+        own = timesteps is None and solver is None and tolerance is None and whole
+        usual = num_inference_steps is None or (
+            isinstance(num_inference_steps, int) and num_inference_steps == self.config.default_num_inference_steps
+        )
         if own and usual and "timesteps" in signature(self.scheduler.set_timesteps).parameters:
             timesteps, num_inference_steps = self.config.default_timesteps, None
         if timesteps is None and tolerance is None:

@@ -25,11 +25,11 @@ GENERATOR = torch.Generator()
 # Of an argument, values that cannot be used, and then values of a kind that cannot be.
 NUMBERS = {
     "guidance_scale": ([NAN, INF, -1e-9, 1e7, 10**400, Fraction(10**400)], ["9", True, [3.0]]),
-    "num_inference_steps": ([0, 10**9], [2.5, "10", True]),
+    "num_inference_steps": ([0, 10**9], [2.5, "10", True, np.zeros((3, 3)), torch.tensor([])]),
     "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
     "num_images_per_prompt": ([0, 10**9], [1.5, True]),
     "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
-    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3], []),
+    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3, np.zeros((3, 3))], []),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
     "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
@@ -50,12 +50,12 @@ TO_IMAGE = {
 STYLIZE = {
     "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
     "touch_weight": ([1.2, -0.1, NAN], ["much", [0.1] * 3]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
-    "init_strength": ([1.5, -0.1, NAN], ["much"]),
+    "init_strength": ([1.5, -0.1, NAN], ["much", np.ones((2, 2))]),
 }  # fmt: skip
 TO_TOUCH = {
     "text": (["  \n", ["brick", ""], []], [3]),
     "audio": ([(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
-              []),
+              [(torch.eye(100).to_sparse(), RATE)]),
     "source_sensor": (["digit"], []),
     "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []), "background": ([torch.zeros(3, 16, 16)], []),
     "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {3: 1}, {}], [[1.0]]),

@@ -54,7 +54,7 @@ def _load(name: str, sound: Any) -> Sound:
         sound = _read(name, sound)
     sound, rate = sound if isinstance(sound, tuple) and len(sound) == 2 else (sound, None)
     samples = sound
-    if isinstance(sound, Tensor):
+    if isinstance(sound, Tensor) and sound.layout == torch.strided and not sound.is_meta:
         samples = (sound.float() if sound.is_floating_point() else sound).detach().cpu().numpy()
     if not isinstance(samples, np.ndarray) or samples.dtype.kind not in "fi":
         wanted = "pass the path of a sound file, or samples, floats or signed integers, with their rate: (array, 16000)"
