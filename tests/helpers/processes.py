@@ -103,6 +103,7 @@ def _call(
     except SystemExit as ended:
         code = ended.code or 0
     except BaseException:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)  # which holds for the file of errors as well
         traceback.print_exc()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
