@@ -51,7 +51,7 @@ def test_descriptions_are_short():
 
 
 def test_a_missing_extra_is_named():
-    with pytest.raises(InvalidInputError, match=r"pip install -c constraints.txt -e '.\[train\]'"):
+    with pytest.raises(InvalidInputError, match=r'pip install "unitouch_gen\[train\]"'):
         errors.needed("no_such_module")
 
 
@@ -77,6 +77,16 @@ def test_a_mistake_is_one_line_and_exit_code_2(error, capsys):
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert not out and err.count("\n") == 1 and err.startswith("unitouch-gen: ") and "a b" in err
+
+
+def test_a_working_folder_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys):
+    """torch would end the process as it is imported."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(SystemExit, match="2"):
+        errors.run_commands(typer.Typer(), "unitouch-gen", [])
+    assert capsys.readouterr().err.startswith("unitouch-gen: The working folder has been deleted;")
 
 
 def test_warnings_of_ours_are_lines_and_others_are_left_out(capsys):

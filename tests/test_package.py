@@ -149,6 +149,10 @@ def test_the_command_line_answers(tmp_path):
     assert "touch-to-image" in run([str(Path(sys.executable).with_name("unitouch-gen")), "--help"], tmp_path)
 
 
+def test_the_package_runs_as_a_module(tmp_path):
+    assert run(["-m", "unitouch_gen", "--version"], tmp_path) == f"unitouch_gen {unitouch_gen.__version__}\n"
+
+
 def test_training_runs_as_a_module(tmp_path):
     helped = run(["-m", "unitouch_gen.training", "--help"], tmp_path)
     assert all(f" {stage} " in helped for stage in STAGES)

@@ -10,9 +10,11 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from unitouch_gen.cli.options import print_table
 from unitouch_gen.streams import StandardStream
 
 SCRIPT = r"""
+import logging
 import sys
 from pathlib import Path
 
@@ -27,6 +29,7 @@ app = typer.Typer()
 @app.command()
 def command() -> None:
     assert is_quiet(False)
+    logging.getLogger("matplotlib").warning("what a library logs")
     for line in range(2000):
         note(f"{line}: h\u00f6he_\u7816.png")
     print_table(["touch"], [["h\u00f6he_\u7816.png"], ["h\udcf6he.png"]])
@@ -51,7 +54,7 @@ def run(folder: Path, redirections: str) -> subprocess.CompletedProcess:
 def test_nobody_has_to_read(tmp_path, redirections):
     done = run(tmp_path, redirections)
     assert done.returncode == 0 and (tmp_path / "made").exists(), done.stderr[-300:]
-    assert b"rror" not in done.stderr
+    assert b"rror" not in done.stderr and b"what a library logs" not in done.stderr
 
 
 def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
@@ -79,3 +82,11 @@ def test_characters_that_an_encoding_lacks_are_replaced(encoding, printed):
         table.add_row(name)
     Console(file=stream, width=80).print(table)
     assert printed in written.getvalue() and b"h\xf6he.png" in written.getvalue()
+
+
+def test_tables_show_names_as_they_are(capsys):
+    """Brackets and colons are no markup of the terminal's."""
+    names = ["gel[red].png", "[/b].png", "a:brick:b.png"]
+    print_table(["touch"], [[name] for name in names])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in names)

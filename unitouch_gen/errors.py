@@ -4,6 +4,7 @@ A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used 
 names the argument, what came, and what to do.
 """
 
+import logging
 import math
 import os
 import re
@@ -54,8 +55,10 @@ def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **opti
         print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
 
     open_standard_streams()
+    logging.getLogger().addHandler(logging.NullHandler())  # or Python prints what libraries log, such as matplotlib
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
+        check_working_folder()
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
             warnings.simplefilter("always", UnfamiliarInputWarning)
@@ -69,6 +72,14 @@ def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **opti
         if message:  # empty where the help has been shown instead
             say(message)
     sys.exit(2)
+
+
+def check_working_folder() -> None:
+    """Raises if the folder that the process is in was deleted, where torch ends the process as it is imported."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise InvalidInputError("The working folder has been deleted; change to one that is there.") from error
 
 
 def expand_home(word: str) -> str:
@@ -100,7 +111,7 @@ def needed(module: str, extra: str = "train") -> Any:
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError) and error.name == module
         why = "is missing" if missing else f"cannot be imported ({first_line(error)})"
-        raise InvalidInputError(f"`{module}` {why}: pip install -c constraints.txt -e '.[{extra}]'") from error
+        raise InvalidInputError(f'`{module}` {why}: pip install "unitouch_gen[{extra}]"') from error
 
 
 def did_you_mean(value: Any, choices: Iterable[str]) -> str:

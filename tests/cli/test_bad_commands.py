@@ -51,6 +51,7 @@ BAD = {
         ("touch-to-image in/dark.png thin.png -o out", "`touch thin.png` is 1 x 1 pixels"),
         (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
         ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
+        ("batch in/dark.png -o out", "`source` is 'in/dark.png', an image; pass its folder"),
         ("batch gone -o out", "'gone', which does not exist"),
         ("convert unitouch --touch in/dark.png -o out", "cannot be read as a checkpoint"),
     ],

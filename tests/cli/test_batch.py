@@ -62,7 +62,7 @@ def test_folders_leave_out_the_hidden_the_foreign_and_what_was_made(here, run, f
 
 def test_words_and_folders_for_x_to_touch(here, run, files):
     (here / "list.csv").write_text("text,sensor\nbrick,digit\nbrick,\n")
-    assert run("list.csv", "--set", "bridge=false", "--sensor", "gelsight", pipeline="x-to-touch")[0] == 0
+    assert run("list.csv", "--set", "bridge=False", "--sensor", "gelsight", pipeline="x-to-touch")[0] == 0
     assert [(line["sensor"], line["bridge"]) for line in lines(here / "out")] == [("digit", False), ("gelsight", False)]
     soundfile.write("in/hit.wav", np.random.default_rng(0).normal(0, 0.1, 4000), 16_000)
     assert run("in", pipeline="x-to-touch")[0] == 0

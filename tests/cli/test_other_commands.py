@@ -1,7 +1,8 @@
 """`unitouch-gen ask`, `classify`, `convert` and `doctor`: what they write and print."""
 
 import json
-from importlib.metadata import version
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,15 @@ def test_doctor_says_what_a_picture_takes(command, models):
     code, out, err = command("doctor", "--model", models["x-to-touch"], "--device", "cpu")
     assert (code, err) == (0, "")
     assert all(word in out for word in (version("torch"), "Runs on cpu", str(Path(weights.__file__).parent), "2 steps"))
+
+
+def test_doctor_runs_in_a_clone_that_is_not_installed(command, models, monkeypatch):
+    def unknown(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(import_module("unitouch_gen.cli.doctor"), "requires", unknown)
+    code, out, err = command("doctor", "--model", models["x-to-touch"], "--device", "cpu")
+    assert (code, err) == (0, "") and "2 steps" in out
 
 
 def test_questions_are_answered_about_every_touch(command, refused, here, capsys):

@@ -10,7 +10,7 @@ from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import DRAWING, files_in, load_pipeline, suffixes_of
+from unitouch_gen.cli.loading import DRAWING, IMAGES, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_file, check_integer, first_line
 from unitouch_gen.files import files_below, find_file, read_table, write_file
@@ -38,6 +38,8 @@ def batch(
     check_choice("--pipeline", pipeline, DRAWING)
     if not source.is_dir():
         check_file("source", source, "a .csv file")
+    if source.suffix.lower() in IMAGES:
+        raise InvalidInputError(f"`source` is {str(source)!r}, an image; pass its folder, or use `touch-to-image`.")
     rows = in_folder(source, pipeline, output) if source.is_dir() else read_table(source)
     import torch
     from accelerate import PartialState

@@ -3,7 +3,7 @@
 import platform
 import re
 import time
-from importlib.metadata import distributions, requires
+from importlib.metadata import PackageNotFoundError, distributions, requires
 
 from typer import echo
 
@@ -20,11 +20,15 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
     Example: unitouch-gen doctor
     """
     costs = [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else DRAWING)]
-    needs = [need for need in requires("unitouch_gen") or [] if not re.search("extra == .(test|lint|docs)", need)]
+    try:
+        needs = [need for need in requires("unitouch_gen") or [] if not re.search("extra == .(test|lint|docs)", need)]
+    except PackageNotFoundError:  # of a clone that nobody has installed
+        needs = []
     known = {one.name.lower().replace("_", "-"): one.version for one in distributions()}
     names = dict.fromkeys(re.split(r"[^\w-]", need)[0] for need in needs)
     packages = [[name, known.get(name.lower().replace("_", "-"), "missing")] for name in names]
-    options.print_table(["package", "installed"], packages)
+    if packages:
+        options.print_table(["package", "installed"], packages)
     echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
     echo(f"Built-in weights: {FAMILY}. Runs on {device_of(device)}")
     options.print_table(["pipeline", "seconds per picture", "weights"], costs)

@@ -70,7 +70,8 @@ def model_options(context: Context) -> dict[str, Any]:
 
 
 def value_of(word: str) -> Any:
-    """A number, a list, true or false, as in JSON; any other word is a text."""
+    """A number, a list, true or false, as in JSON or Python; any other word is a text."""
+    word = {"True": "true", "False": "false", "None": "null"}.get(word, word)
     try:
         return json.loads(word)
     except ValueError:
@@ -108,4 +109,5 @@ def print_table(columns: list[str], rows: list[list[str]]) -> None:
     table = Table(*columns)
     for row in rows:
         table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    width = None if sys.stdout.isatty() else 120
+    Console(width=width, markup=False, emoji=False).print(table)  # a file's name may hold [red] or :brick:
