@@ -48,7 +48,7 @@ from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
 from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
-from unitouch_gen.saving import filling
+from unitouch_gen.saving import SAVING_OPTIONS, filling
 
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
@@ -442,11 +442,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         check_kind("card", card, Card, type(None))
         if not safe_serialization:
             raise InvalidInputError("`safe_serialization` is False, but only safetensors are written; leave it out.")
+        check_arguments("`save_pretrained`", kwargs, SAVING_OPTIONS)
         folder = as_path("save_directory", save_directory)
         upload = kwargs.pop("push_to_hub", False)
-        name = kwargs.pop(
-            "repo_id", os.path.basename(os.path.realpath(folder))
-        )  # Path.resolve raises on a loop of links
+        folder_name = os.path.basename(os.path.realpath(folder))  # Path.resolve raises on a loop of links
+        name = kwargs.pop("repo_id", folder_name)
         networks = [part for part in self.components.values() if isinstance(part, torch.nn.Module)]
         if any(hasattr(one, "base_layer") for network in networks for one in network.modules()):
             raise InvalidInputError("LoRA weights are loaded; fuse them or not, then call `unload_lora_weights`.")

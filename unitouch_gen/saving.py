@@ -12,13 +12,36 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_arguments
 from unitouch_gen.files import UNFINISHED, as_path, check_replaceable, files_below, share_as_usual, writing_to
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+SAVING_OPTIONS = (
+    "commit_description",
+    "commit_message",
+    "create_pr",
+    "distributed_checkpoint",
+    "is_main_process",
+    "max_shard_size",
+    "private",
+    "push_to_hub",
+    "repo_id",
+    "revision",
+    "safe_serialization",
+    "save_function",
+    "save_original_format",
+    "save_peft_format",
+    "state_dict",
+    "tags",
+    "token",
+    "use_flashpack",
+    "variant",
+)
+"""Options of `save_pretrained` and `push_to_hub` of diffusers and transformers, which ignore others."""
 
 SHARD_NUMBER = re.compile(r"-\d+-of-\d+(?=\.safetensors$)")
 
@@ -153,6 +176,7 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
     @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
     def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
         folder = as_path("save_directory", save_directory)
+        check_arguments("`save_pretrained`", kwargs, SAVING_OPTIONS)
         repo_id = kwargs.pop("repo_id", None)
         with filling("save_directory", folder) as place:
             save(self, place, *args, **kwargs)

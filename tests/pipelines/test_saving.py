@@ -167,6 +167,8 @@ def test_misspelt_arguments_are_refused_with_the_one_that_was_meant(family, pipe
         (partial(UniTouchProcessor.from_pretrained, family / "processor"), "imagesize", "image_size"),
         (partial(pipe.load_lora_weights, family), "weight_nmae", "weight_name"),
         (partial(load_pipeline, "touch-to-image", model=None), "dtpye", "dtype"),
+        (partial(pipe.save_pretrained, family), "varient", "variant"),  # which would replace the whole weights
+        (partial(pipe.unitouch.save_pretrained, family / "unitouch"), "max_shard_sice", "max_shard_size"),
     ):
         with pytest.raises(InvalidTypeError, match=f"^`{name}` is no argument of .* Did you mean '{meant}'"):
             call(**{name: None})
