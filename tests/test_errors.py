@@ -10,11 +10,7 @@ import torch
 import typer
 
 from unitouch_gen import errors
-from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError, UnfamiliarInputWarning
-from unitouch_gen.models.images import load_images
-from unitouch_gen.models.joint import stored_tensors
-from unitouch_gen.models.sounds import load_sounds
 
 integer = partial(errors.check_integer, "x", low=1, high=5)
 number = partial(errors.check_number, "x", low=0.0, high=1.0)
@@ -99,20 +95,3 @@ def test_warnings_of_ours_are_lines_and_others_are_left_out(capsys):
 
     errors.run_commands(app, "unitouch-gen", [])
     assert capsys.readouterr().err == "unitouch-gen: a touch\n"
-
-
-def test_a_pointer_of_git_lfs_is_named_whatever_it_stands_for(tmp_path):
-    """In place of images, sounds, checkpoints and weights alike."""
-    pointer = tmp_path / "model.safetensors"
-    pointer.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 123\n")
-    readers = [
-        partial(errors.check_file, "x", pointer, "weights"),
-        partial(load_images, "x", pointer),
-        partial(load_sounds, "x", pointer),
-        partial(open_checkpoint, "x", pointer),
-    ]
-    for read in readers:
-        with pytest.raises(InvalidInputError, match=r"is a Git LFS pointer to .*; run `git lfs pull`"):
-            read()
-    with pytest.raises(InvalidInputError, match="is a Git LFS pointer to weights"):
-        stored_tensors(tmp_path)

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line
+from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line, is_lfs_pointer
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
@@ -214,6 +214,8 @@ def is_hidden(path: Path) -> bool:
 def read_text(file: Path) -> str:
     """A text in UTF-8, or in UTF-16 as spreadsheets write it; nothing where there is no file."""
     content = file.read_bytes() if file.is_file() else b""
+    if file.is_file() and is_lfs_pointer(file):
+        raise InvalidInputError(f"{str(file)!r} is a Git LFS pointer; run `git lfs pull` in its repository.")
     try:
         return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
     except UnicodeDecodeError as error:
@@ -314,6 +316,12 @@ def class_name(settings: dict[str, Any]) -> Any:
     return name[-1] if isinstance(name, list) and name else name
 
 
+def model_files(place: Path) -> list[Path]:
+    """A file itself, or the weights, settings and vocabularies in a folder and its components."""
+    files = [place] if place.is_file() else [*place.glob("*"), *place.glob("*/*")]
+    return [file for file in files if file.suffix in (".safetensors", ".json", ".txt") and file.is_file()]
+
+
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
@@ -330,6 +338,9 @@ def reading(name: str, place: Any) -> Iterator[None]:
         except Exception as error:  # of as many kinds as there are readers
             if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
                 raise
+            if pointer := next(filter(is_lfs_pointer, model_files(folder)), None):
+                why = f"{str(pointer)!r} is a Git LFS pointer; run `git lfs pull` in its repository."
+                raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}") from error
             why = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
             hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
             raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}{hint}") from error

@@ -1,6 +1,8 @@
 """Pictures of every accepted kind become the same pixels, squared as CLIP's own processor does; others are refused."""
 
 import io
+import struct
+import zlib
 from fractions import Fraction
 from pathlib import Path
 
@@ -8,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageCms
-from PIL.PngImagePlugin import PngInfo
 from transformers import CLIPImageProcessorPil
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
@@ -175,21 +176,34 @@ def test_a_camera_held_sideways_is_turned_back(processor: UniTouchProcessor, tmp
         torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
 
 
-def test_a_png_with_much_compressed_text_is_read_as_it_looks(processor: UniTouchProcessor, tmp_path: Path) -> None:
-    """Image tools keep their graphs of nodes in texts, which Pillow refuses to read beyond a megabyte."""
-    texts = PngInfo()
-    texts.add_itxt("workflow", "node " * 10**6, zip=True)
-    texts.add_text("prompt", "node " * 10**6, zip=True)
-    Image.fromarray(PICTURE).save(tmp_path / "graph.png", pnginfo=texts)
-    with pytest.raises(ValueError, match="too large"):
-        Image.open(tmp_path / "graph.png").load()
-    found = processor.raw_images(tmp_path / "graph.png")
-    torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """A chunk of a PNG (W3C, Portable Network Graphics, 5.3)."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def test_a_png_whose_exif_is_broken_is_read_as_it_is_stored(processor: UniTouchProcessor, tmp_path: Path) -> None:
-    Image.fromarray(PICTURE).save(tmp_path / "broken.png", exif=b"Exif\0\0MM\0*\0\0\0\x08\xff\xff")
-    found = processor.raw_images(tmp_path / "broken.png")
+def test_what_a_png_holds_beside_its_picture_does_not_matter(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Texts of megabytes, before the pixels and after them, a large colour profile, and broken EXIF."""
+    text, srgb = zlib.compress(bytes(4 << 20)), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    whole, file = encoded("png", Image.fromarray(PICTURE)), tmp_path / "workflow.png"
+    for beside in (
+        chunk(b"zTXt", b"workflow\0\0" + text),
+        chunk(b"iTXt", b"prompt\0\1\0\0\0" + text),
+        chunk(b"tEXt", b"workflow\0" + bytes(1 << 20)) * 65,
+        chunk(b"iCCP", b"sRGB\0\0" + zlib.compress(srgb + bytes(2 << 20))),
+        chunk(b"eXIf", b"junk" * 9),
+    ):
+        for place in (33, len(whole) - 12):  # after IHDR, before IEND
+            file.write_bytes(whole[:place] + beside + whole[place:])
+            found = processor.raw_images(file)
+            torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1.01 / 255)
+
+
+def test_a_png_is_turned_as_its_texts_say(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    """Those of XMP, by EXIF's table of orientations: 6 has the first row at the right."""
+    xmp = b'XML:com.adobe.xmp\0\0\0\0\0<x tiff:Orientation="6"/>'
+    stored = encoded("png", Image.fromarray(np.ascontiguousarray(PICTURE.transpose(1, 0, 2)[::-1])))
+    (tmp_path / "turned.png").write_bytes(stored[:33] + chunk(b"iTXt", xmp) + stored[33:])
+    found = processor.raw_images(tmp_path / "turned.png")
     torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
 
 
@@ -209,6 +223,16 @@ FILES = {
     "bomb": encoded("png", Image.new("1", (9_000, 8_000))),
     **{f"cut {suffix}": encoded(suffix)[:-200] for suffix in ("png", "jpeg")},
 }
+
+
+def test_a_png_that_claims_too_many_pixels_is_refused_before_they_are_decoded(tmp_path: Path, monkeypatch) -> None:
+    """By a path that begins with `~`, the home folder."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 1, 0, 0, 0, 0))
+    whole = encoded("png")
+    (tmp_path / "touch.png").write_bytes(whole[:8] + header + whole[33:])
+    with pytest.raises(InvalidInputError, match=r"`touch` names .*400000000 pixels.* pass a smaller one"):
+        load_images("touch", "~/touch.png")
 
 
 def test_a_file_that_is_no_image_or_too_large_is_refused(tmp_path: Path) -> None:

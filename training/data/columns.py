@@ -15,7 +15,7 @@ from pydantic import Field, PositiveInt
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_file
 from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
@@ -196,6 +196,7 @@ def as_bytes(pixels: Tensor) -> np.ndarray:
 def sound_of(record: Record, data: RecordSet) -> Any:
     """A record's sound as processors take it: its file, or samples and their rate."""
     file = str(record.sound)
+    check_file("sound", file, "a sound file")
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, first_line, needed
+from unitouch_gen.errors import InvalidInputError, check_file, first_line, needed
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.records import Frame, Record, found
 
@@ -21,6 +21,7 @@ LOOKS_LIKE, CLASSES = ("calandra_corl2017_*.h5",), {"grasp": ("dropped", "lifted
 def read(folder: Path) -> Iterator[Record]:
     """Two records for each attempt."""
     for file in found(folder, "*.h5"):
+        check_file("path", file, "an HDF5 file")
         try:
             with needed("h5py").File(file) as opened:
                 attempts = opened["data"]  # what deepdish calls a list that is a file's only value

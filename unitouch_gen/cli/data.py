@@ -23,11 +23,10 @@ def check(
 
     Example: unitouch-gen data check touches/
     """
-    import numpy as np
-
     from unitouch_gen.models.sounds import load_sounds
     from unitouch_gen.training.data import open_dataset
     from unitouch_gen.training.data.cache import for_each
+    from unitouch_gen.training.data.columns import sound_of
     from unitouch_gen.training.data.records import few
 
     data = open_dataset(path, kind, sensor=sensor, materials=by_comma(materials))
@@ -38,7 +37,9 @@ def check(
         for frame in filter(None, (record.picture, record.background)):
             frame.read()
         if record.sound:
-            np.load(record.sound) if record.sound.endswith(".npy") else load_sounds("sound", record.sound)
+            sound = sound_of(record, data)
+            if isinstance(sound, str):
+                load_sounds("sound", sound)
         same[blake2b(record.touch.read().contiguous().numpy().tobytes()).digest()].append(row)
 
     broken = for_each(read, data, is_quiet(False))

@@ -86,6 +86,7 @@ def _read(name: str, file: str | os.PathLike) -> tuple[np.ndarray, int]:
     """Samples (channels, T) of a file, and their rate."""
     import soundfile
 
+    file = os.path.expanduser(file)
     check_file(name, file, "a sound file")
     try:
         samples, rate = soundfile.read(os.fsencode(file), dtype="float32", always_2d=True)

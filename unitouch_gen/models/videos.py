@@ -126,7 +126,8 @@ def firmest(name: str, source: str | os.PathLike | Iterator[ImageInput]) -> Tens
     if not candidates:
         wanted = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}; begin to record before you press.")
-    firmest_of_each = [one for rest in candidates if (one := _most_changed(contacts, rest)) is not None]
+    changed = [_most_changed(contacts, rest) for rest in candidates]
+    firmest_of_each = [one for one in changed if one is not None]
     if not firmest_of_each:
         wanted = "no frames differ from the gel at rest; press while it records"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
@@ -269,6 +270,7 @@ def read_video(name: str, place: str | os.PathLike) -> Iterator[np.ndarray]:
     """
     av: Any = needed("av")
     undecodable = av.FFmpegError  # which the module has no more when Python ends amid frames
+    place = os.path.expanduser(place)
     check_file(name, place, "a video")
     options = {"protocol_whitelist": "file"}  # a list of other places is no video
     try:
