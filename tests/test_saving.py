@@ -1,10 +1,12 @@
 """Folders of models: nothing in them is lost, whatever is there, fails, is killed, or is saved at the same time."""
 
+import json
 import os
 import shutil
 import subprocess
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from safetensors.torch import save_file
 
 from tests.helpers.processes import Child, finished
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import is_unfinished, reading, replacing, write_file
+from unitouch_gen.files import UNFINISHED, is_unfinished, reading, replacing, write_file
 from unitouch_gen.saving import filling
 
 
@@ -70,6 +72,9 @@ def test_files_get_the_mode_that_new_files_get_there(tmp_path):
         os.umask(before)
     files = (tmp_path / "model" / "a.safetensors", tmp_path / "b.safetensors")
     assert [file.stat().st_mode & 0o777 for file in files] == [0o640, 0o640]
+    files[1].chmod(0o600)  # a file that is replaced keeps its own
+    write_file("x", files[1], "new")
+    assert files[1].stat().st_mode & 0o777 == 0o600
 
 
 @pytest.fixture
@@ -113,8 +118,8 @@ def test_a_name_that_libraries_cannot_write_is_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_save_leaves_the_old_files_or_the_new_ones_or_a_folder_that_is_refused(tmp_path):
-    """Wherever the process is killed, files of two saves are never read as one model; the next save mends it."""
+def test_a_killed_save_leaves_the_old_files_or_the_new_ones(tmp_path):
+    """Wherever the process is killed: a save that was decided is finished by whoever reads or fills the folder next."""
     folder = tmp_path / "model"
     fill(folder, "old")
     changes = finished(Child(fill, folder, "old", folder=tmp_path)).changes
@@ -123,15 +128,54 @@ def test_a_killed_save_leaves_the_old_files_or_the_new_ones_or_a_folder_that_is_
         assert Child(fill, folder, "new", folder=tmp_path, killed_at=killed_at).wait() == -9
         if is_unfinished(folder):
             states.add("unfinished")
-            with pytest.raises(InvalidInputError, match=r"`model` is .*a save into it is under way or was cut off"):
-                reading("model", folder).__enter__()
-        else:
-            one, other = (folder / "a.txt").read_text(), (folder / "part" / "b.json").read_text()
-            assert one == other
-            states.add(one)
+            if killed_at % 2:
+                with reading("model", folder):
+                    pass
+            else:
+                fill(folder, "newer", parts=["c.txt"])
+        one, other = (folder / "a.txt").read_text(), (folder / "part" / "b.json").read_text()
+        assert one == other and not is_unfinished(folder)
+        states.add(one)
         fill(folder, "old")
-        assert not is_unfinished(folder) and (folder / "part" / "b.json").read_text() == "old"
     assert states == {"old", "unfinished", "new"}
+
+
+def test_a_plan_of_a_save_that_leads_out_of_its_folder_is_not_followed(tmp_path):
+    """As a folder from elsewhere could hold one."""
+    precious = write_file("x", tmp_path / "mine" / "precious.txt", "mine")
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "link").symlink_to(precious.parent)
+    for removed in ("../mine/precious.txt", str(precious), "link/precious.txt"):
+        (folder / UNFINISHED).write_text(json.dumps({"moves": [], "removed": [removed]}))
+        with suppress(InvalidInputError), reading("model", folder):
+            pass
+        assert precious.is_file()
+    (folder / UNFINISHED).write_text("{}")
+    with pytest.raises(InvalidInputError, match="is no plan of a save"), reading("model", folder):
+        pass
+
+
+def test_two_components_in_one_folder_are_refused_before_anything_changes(tmp_path):
+    write_file("x", tmp_path / "one" / "a.txt", "old")
+    (tmp_path / "other").symlink_to("one")
+    with pytest.raises(InvalidInputError, match=r"link to another component's folder. Nothing was changed"):
+        fill(tmp_path, parts=["one/a.txt", "other/a.txt"])
+    assert names(tmp_path / "one") == {"a.txt"} and (tmp_path / "one" / "a.txt").read_text() == "old"
+
+
+def test_a_reader_beside_a_save_reads_one_of_two_models(tmp_path):
+    """Files take their places when the reader has ended."""
+    fill(tmp_path / "model", "one")
+    with ThreadPoolExecutor() as pool:
+        with reading("model", tmp_path / "model"):
+            first = (tmp_path / "model" / "a.txt").read_text()
+            saved = pool.submit(fill, tmp_path / "model", "two")
+            with pytest.raises(TimeoutError):
+                saved.result(timeout=0.3)
+            assert first == (tmp_path / "model" / "part" / "b.json").read_text() == "one"
+        saved.result()
+    assert (tmp_path / "model" / "part" / "b.json").read_text() == "two"
 
 
 def test_of_two_saves_at_once_one_is_there(tmp_path):

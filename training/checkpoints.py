@@ -9,6 +9,7 @@ import os
 import re
 import warnings
 import zipfile
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_settings
 
 CHECKPOINT_FILE = re.compile(
-    r"(model|optimizer|scheduler|sampler|scaler|random_states|custom_checkpoint)[\w-]*"
-    r"\.(safetensors|safetensors\.index\.json|bin|pkl|pt|json)"
+    r"model(-\d+-of-\d+)?\.safetensors|model(_\d+)?\.safetensors|model\.safetensors\.index\.json|scaler\.pt"
+    r"|(optimizer|scheduler|sampler)(_\d+)?\.bin|(random_states|custom_checkpoint)_\d+\.pkl"
 )
 """Names that accelerate gives to files of a checkpoint."""
 
@@ -73,15 +74,17 @@ def read_progress(output: Path) -> dict[str, Any]:
 
 
 def _damaged_file(checkpoint: Path) -> Path | None:
-    """The first file of a checkpoint that is missing, cut off or changed on disk; `None` if all are whole."""
+    """The first file of a checkpoint that is missing, cut off or, if it is a zip, fails its checksum; else `None`."""
     try:
-        names = json.loads((checkpoint / "progress.json").read_text())["files"]
-    except (ValueError, TypeError):
+        progress = json.loads((checkpoint / "progress.json").read_text())
+        # Those of earlier versions list no files.
+        names = progress.get("files") or [file.name for file in files_of_checkpoint(checkpoint)]
+        files = [checkpoint / Path(name).name for name in names]
+    except (ValueError, TypeError, AttributeError):
         return checkpoint / "progress.json"
-    except KeyError:  # written before checkpoints listed their files
-        names = [file.name for file in files_of_checkpoint(checkpoint)]
-    for name in names:
-        file = checkpoint / name
+    for file in files:
+        if not os.path.isfile(file):
+            return file
         try:
             if file.suffix == ".safetensors":
                 with safe_open(file, framework="pt"):  # compares the length with what the header says
@@ -90,13 +93,13 @@ def _damaged_file(checkpoint: Path) -> Path | None:
                 with zipfile.ZipFile(file) as archive:
                     if archive.testzip() is not None:
                         return file
-        except (OSError, SafetensorError, zipfile.BadZipFile):
+        except (OSError, SafetensorError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError):
             return file
     return None
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Removes the files of a checkpoint, the one that makes it whole first, and its folder if nothing else is in it."""
+    """Removes the files of a checkpoint, `progress.json` first, and its folder if nothing else is in it."""
     (folder / "progress.json").unlink(missing_ok=True)
     for file in files_of_checkpoint(folder):
         file.unlink()

@@ -23,7 +23,7 @@ from typer import Option
 from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import image_embeddings
-from unitouch_gen.files import check_writable, files_below
+from unitouch_gen.files import check_writable, files_below, is_hidden
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.saving import filling
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
@@ -224,10 +224,8 @@ class Stage:
 
 def _difference(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> str:
     """The first data set that is not what it was, in words."""
-    for one, other in zip_longest(before, now):
-        if one != other:
-            return f"{json.dumps(one) if one else 'nothing'} then, {json.dumps(other) if other else 'nothing'} now"
-    return "nothing differs"
+    one, other = next(pair for pair in zip_longest(before, now) if pair[0] != pair[1])
+    return f"{json.dumps(one) if one else 'nothing'} then, {json.dumps(other) if other else 'nothing'} now"
 
 
 def folders_of(name: str) -> set[str]:
@@ -238,7 +236,8 @@ def folders_of(name: str) -> set[str]:
 def weights_of(folder: Path) -> str:
     """SHA-256 of all the safetensors below a folder, also behind links: of their names and bytes."""
     digest = hashlib.sha256()
-    for file in sorted(file for file in files_below(folder) if file.suffix == ".safetensors"):
+    files = [file for file in files_below(folder) if not is_hidden(file.relative_to(folder))]  # as of a save cut off
+    for file in sorted(file for file in files if file.suffix == ".safetensors"):
         digest.update(f"{file.relative_to(folder).as_posix()}\n".encode())
         with file.open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())

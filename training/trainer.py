@@ -203,7 +203,7 @@ class Trainer:
                 flush(file)  # the checkpoint before this one goes, so a power cut must not take this one
             names = [file.name for file in files]
             progress = {"step": self.step, "seconds": self.seconds, "files": names, **self.progress}
-            write_file("output", folder / "progress.json", json.dumps(progress))
+            flush(write_file("output", folder / "progress.json", json.dumps(progress)))
             kept = checkpoints_in(self.output)[-self.config.keep_checkpoints :]
             for old in checkpoint_folders(self.output):
                 if old not in kept:

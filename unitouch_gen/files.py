@@ -10,12 +10,17 @@ import re
 import tempfile
 import threading
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line, is_lfs_pointer
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
@@ -54,7 +59,7 @@ _LOADING = threading.RLock()  # libraries patch torch in all threads while they 
 # Writing --------------------------------------------------------------------------------------------------------------
 
 UNFINISHED = ".unfinished-save"
-"""Lies in a folder while files of a save take their places, and stays there if the save is cut off."""
+"""Lies in a folder while files of a save take their places, and says which; stays there if the save is cut off."""
 
 
 @contextmanager
@@ -86,7 +91,7 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
             partial = Path(hidden) / file.name
             yield partial
-            share_as_usual([partial], Path(hidden))
+            share_as_usual(partial, target)
             os.replace(partial, target)
 
 
@@ -107,26 +112,73 @@ def check_writable(name: str, file: Path) -> None:
         tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above).cleanup()
 
 
-def share_as_usual(files: Iterable[Path], folder: Path) -> None:
-    """Gives files the permissions that new files in a folder get; safetensors' own, 0600, shut out a group."""
-    probe = folder / ".mode"
-    probe.touch()
-    mode = probe.stat().st_mode & 0o777
-    probe.unlink()
-    for file in files:
-        with suppress(OSError):  # of file systems without permissions
-            file.chmod(mode)
+def share_as_usual(file: Path, destination: Path) -> None:
+    """Gives a file the permissions of the one that it replaces, or of a new one; safetensors' own are 0600."""
+    if os.path.exists(destination):
+        mode = destination.stat().st_mode & 0o777
+    else:
+        probe = file.with_name(f".{file.name}.mode")
+        probe.touch()
+        mode = probe.stat().st_mode & 0o777
+        probe.unlink()
+    with suppress(OSError):  # of file systems without permissions
+        file.chmod(mode)
 
 
 def check_replaceable(file: Path) -> None:
     """Raises `FileExistsError` where there is something other than a file."""
     if os.path.exists(file) and not os.path.isfile(file):
-        raise FileExistsError(errno.EEXIST, f"{file.name} is there and is not a file")
+        raise FileExistsError(errno.EEXIST, f"{file.name} is a folder or a device")
+
+
+@contextmanager
+def locked(folder: Path, *, shared: bool = False) -> Iterator[None]:
+    """Holds a lock on a folder, so that saves do not mix with each other or, `shared`, with a reader.
+
+    Without one where the system has none.
+    """
+    if fcntl is None or not os.path.isdir(folder):
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # of file systems without locks
+            fcntl.flock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def is_unfinished(folder: Path) -> bool:
-    """Whether a save into a folder is under way or was cut off."""
+    """Whether a save into a folder was cut off while its files took their places."""
     return os.path.exists(folder / UNFINISHED)
+
+
+def finish_save(folder: Path) -> None:
+    """Finishes a save that was decided: its files take their places, and older weights of the same components go.
+
+    The folder is `locked`. A plan that leads out of the folder is refused.
+    """
+    if not is_unfinished(folder):
+        return
+    try:
+        plan = json.loads((folder / UNFINISHED).read_text())
+        parts = [*(part for move in plan["moves"] for part in move), *plan["removed"]]
+        moves = [(folder / beside, folder / destination) for beside, destination in plan["moves"]]
+        removed = [folder / part for part in plan["removed"]]
+    except (ValueError, TypeError, LookupError) as error:
+        raise InvalidInputError(f"`{folder / UNFINISHED}` is no plan of a save; save again.") from error
+    if any(Path(part).is_absolute() or ".." in Path(part).parts for part in parts):
+        raise InvalidInputError(f"`{folder / UNFINISHED}` leads out of its folder.")
+    for beside, destination in moves:
+        if os.path.lexists(beside):  # and is not in its place yet
+            os.replace(beside, destination)
+    inside = os.path.realpath(folder)
+    for file in removed:
+        # A plan that came with a downloaded folder could name files behind a link.
+        if os.path.commonpath([inside, os.path.realpath(file.parent)]) == inside:
+            file.unlink(missing_ok=True)
+    (folder / UNFINISHED).unlink()
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
@@ -328,10 +380,12 @@ def reading(name: str, place: Any) -> Iterator[None]:
     import torch
 
     folder = as_path(name, place)
-    with _LOADING, torch.inference_mode(False):  # inference tensors can never be trained
+    if is_unfinished(folder):
+        with writing_to(name, folder), locked(folder):
+            finish_save(folder)
+    # Inference tensors can never be trained.
+    with _LOADING, torch.inference_mode(False), locked(folder, shared=True):
         try:
-            if is_unfinished(folder):
-                raise InvalidInputError("a save into it is under way or was cut off. Save again.")
             for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
                 read_settings(name, file)  # libraries name no file, and would wait for a pipe
             yield

@@ -1,5 +1,6 @@
 """Folders of models that are filled and lose nothing: each file takes its place by a rename when all are written."""
 
+import errno
 import functools
 import inspect
 import json
@@ -13,12 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, check_arguments
-from unitouch_gen.files import UNFINISHED, as_path, check_replaceable, files_below, share_as_usual, writing_to
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+from unitouch_gen.files import (
+    UNFINISHED,
+    as_path,
+    check_replaceable,
+    files_below,
+    finish_save,
+    locked,
+    share_as_usual,
+    write_file,
+    writing_to,
+)
 
 SAVING_OPTIONS = (
     "commit_description",
@@ -51,8 +57,8 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
     """An empty folder to write to, whose files take their places in `folder` when the block ends without an error.
 
     Everything else in `folder` stays as it is, but for older weights of the components that were written (another
-    number of shards). Files take their places one by one, weights first and configs last. While they do, and if that is
-    cut off, `UNFINISHED` lies in `folder`, and `reading` refuses it.
+    number of shards). Files take their places one by one, weights first and configs last. If that is cut off, whoever
+    reads the folder next, by `reading`, finishes it.
 
     Raises:
         InvalidInputError: If `folder` cannot be written to; what was there stays.
@@ -64,7 +70,9 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
         staging = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
         try:
             yield staging
-            moves = _move_beside(staging, target)
+            with locked(target):
+                finish_save(target)
+                _decide(staging, target)
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             if is_new:
@@ -72,16 +80,16 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
                     target.rmdir()
             raise
     try:
-        with _locked(target):
-            _put_in_place(moves, target)
+        with locked(target):
+            finish_save(target)
     except OSError as error:
-        why = f"{error.strerror}. Files that are not in place yet lie beside it, as {staging.name}. Save again."
+        why = f"{error.strerror}. The files are there under hidden names, and take their places when it is read."
         raise InvalidInputError(f"`{name}` was written in part to {str(target)!r}: {why}") from error
     shutil.rmtree(staging, ignore_errors=True)
 
 
-def _move_beside(staging: Path, target: Path) -> dict[Path, Path]:
-    """Moves staged files beside their destinations, under hidden names; returns destinations by those.
+def _decide(staging: Path, target: Path) -> None:
+    """Moves staged files beside their destinations, under hidden names, and writes down where they go.
 
     Only a move within one folder is sure to be a rename: folders inside `target` may be mounts or links.
     """
@@ -93,16 +101,20 @@ def _move_beside(staging: Path, target: Path) -> dict[Path, Path]:
             check_replaceable(destination)
             _make_folders(destination.parent, new_folders)
             beside = destination.with_name(f".{destination.name}{staging.name}")
+            if os.path.lexists(beside):
+                why = f"{destination.parent.name} is a link to another component's folder"
+                raise FileExistsError(errno.EEXIST, why)
             moves[beside] = destination
+            share_as_usual(staged, destination)
             shutil.move(staged, beside)
+        _write_plan(moves, target)
     except BaseException:
         for beside in moves:
             beside.unlink(missing_ok=True)
         for folder in reversed(new_folders):
-            folder.rmdir()
+            with suppress(OSError):  # of a folder that another save has filled meanwhile
+                folder.rmdir()
         raise
-    share_as_usual(moves, staging)
-    return moves
 
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
@@ -114,18 +126,14 @@ def _make_folders(folder: Path, made: list[Path]) -> None:
     folder.mkdir(exist_ok=True)  # raises if a file is there
 
 
-def _put_in_place(moves: dict[Path, Path], target: Path) -> None:
-    """Renames files to their destinations, then removes what earlier saves left of the same weights."""
-    earlier = _earlier_weights([*moves.values()])
-    folders = sorted({target, *(destination.parent for destination in moves.values())})
-    for folder in folders:
-        (folder / UNFINISHED).touch()
-    for beside, destination in sorted(moves.items(), key=lambda move: _order(move[1])):
-        os.replace(beside, destination)
-    for file in earlier:
-        file.unlink(missing_ok=True)
-    for folder in reversed(folders):
-        (folder / UNFINISHED).unlink(missing_ok=True)
+def _write_plan(moves: dict[Path, Path], target: Path) -> None:
+    """Writes down which files take which places, and which older weights go; from then on the save is decided."""
+    ordered = sorted(moves.items(), key=lambda move: _order(move[1]))
+    plan = {
+        "moves": [[str(path.relative_to(target)) for path in move] for move in ordered],
+        "removed": sorted(str(file.relative_to(target)) for file in _earlier_weights([*moves.values()])),
+    }
+    write_file("save_directory", target / UNFINISHED, json.dumps(plan))
 
 
 def _order(destination: Path) -> tuple[bool, int, Path]:
@@ -153,21 +161,6 @@ def _shards_in(index: Path) -> set[str]:
         return set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return set()
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Holds a lock on a folder, so that the files of two saves do not mix; without one where the system has none."""
-    if fcntl is None:
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # of file systems without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:

@@ -143,7 +143,8 @@ def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tm
     assert [folder.name for folder in checkpoints_in(tmp_path)] == [f"step-{step:08d}" for step in (10, 15, 20)]
     (tmp_path / "checkpoints" / "step-00000020" / "progress.json").unlink()  # as if killed while it was written
     (tmp_path / "checkpoints" / ".DS_Store").touch()
-    (tmp_path / "checkpoints" / "step-00000010" / "notes.txt").touch()
+    for name in ("model_notes.json", "model-best.pt"):
+        (tmp_path / "checkpoints" / "step-00000010" / name).touch()
     shutil.copytree(tmp_path / "checkpoints" / "step-00000015", tmp_path / "checkpoints" / "step-00000015-best")
     trainer, _ = make(tmp_path)
     trainer.resume()
@@ -154,7 +155,8 @@ def test_the_last_checkpoints_stay_and_nothing_of_half_ones_or_an_earlier_run(tm
         killed.fit()
     theirs = {".DS_Store", "step-00000010", "step-00000015-best"}
     assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"step-00000005", *theirs}
-    assert [path.name for path in (tmp_path / "checkpoints" / "step-00000010").iterdir()] == ["notes.txt"]
+    kept = {path.name for path in (tmp_path / "checkpoints" / "step-00000010").iterdir()}
+    assert kept == {"model_notes.json", "model-best.pt"}
     assert (tmp_path / "checkpoints" / "step-00000015-best" / "model.safetensors").is_file()
     assert not (tmp_path / "log.jsonl").exists()
 

@@ -40,8 +40,10 @@ def read(folder: Path) -> Iterator[Record | str]:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     records = list(read_rows(folder, tables[0]) if tables else read_tree(folder))
     if not records:
-        expected = "MATERIAL/x.png, MATERIAL/OBJECT/x.png, or these in train/, val/ and test/; or a table, labels.csv"
-        raise InvalidInputError(f"no touch is where one is expected, which is {expected}.")
+        expected = (
+            "MATERIAL/x.png or MATERIAL/OBJECT/x.png, perhaps in train/, val/ and test/; or name them in labels.csv"
+        )
+        raise InvalidInputError(f"it has no touches where they are expected: {expected}.")
     yield from records
     used = set(map(str, tables)).union(*(record.files for record in records))
     unread = [file.relative_to(folder).as_posix() for file in found(folder, "**/*") if str(file) not in used]

@@ -218,7 +218,7 @@ def test_a_table_names_files_however_their_letters_are_composed(tmp_path: Path) 
 
 def test_a_folder_in_which_no_touch_is_where_one_is_expected_says_where(tmp_path: Path) -> None:
     write(tmp_path, {"a/b/c/d/1.png": 1})
-    with pytest.raises(InvalidInputError, match=r"no touch is where one is expected, which is MATERIAL/x\.png"):
+    with pytest.raises(InvalidInputError, match=r"it has no touches where they are expected: MATERIAL/x\.png"):
         open_dataset(tmp_path)
 
 
