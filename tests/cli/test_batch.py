@@ -107,6 +107,7 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         (here / "table.csv").write_text(table)
         refused(run("table.csv", *words), said)
         assert files(here) == ["in/bright.png", "in/dark.png", "table.csv"]
+    refused(run("in", "-o", "in"), "`--output` is 'in', the folder of the inputs")
     (here / "empty").mkdir()
     refused(run("empty"), "`source` is 'empty', where there are no images")
 

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,6 +107,8 @@ def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]
     """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
+    if os.path.realpath(output) == os.path.realpath(folder):
+        raise InvalidInputError(f"`--output` is {str(output)!r}, the folder of the inputs; name another one.")
     paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
     files = files_in("source", str(folder), folder, paths, columns)
     places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]

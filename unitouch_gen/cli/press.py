@@ -27,14 +27,14 @@ def press(
     at: Annotated[list[str] | None, Option(help="Place of a contact: X,Y in mm from the centre; repeatable.")] = None,
     image_size: Annotated[int, Option("--image-size", "--size", help="Side of the images, pixels.")] = 128,
     depth_maps: Annotated[bool, Option("--depth-maps", metavar="", help="Write depth maps, 16-bit PNG, too.")] = False,
-    seed: Annotated[int, Option(min=0, max=2**32, help="Seed of the camera's noise.")] = 0,
+    seed: Annotated[int, Option(min=0, max=options.MAX_SEED, help="Seed of the camera's noise.")] = 0,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Makes touch images of height maps, by any sensor.
 
     Floats are heights in mm; 8 and 16 bit images run from 0 to `--relief-mm`. Images are named after map, sensor and
-    contact. A depth map beside each says in its metadata how many mm a level and a pixel are.
+    contact. With `--depth-maps`, a depth map beside each says in its metadata how many mm a level and a pixel are.
 
     Example: unitouch-gen press example:coin --mm 24 --sensor all -o touches/
     """

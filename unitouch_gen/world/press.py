@@ -137,7 +137,7 @@ def _place(place: Any, mm: float, height: Tensor) -> tuple[float, float]:
     half_width, half_height = 0.5 * mm, 0.5 * mm * rows / columns
     if abs(x) > half_width or abs(y) > half_height:
         most = f"{half_width:g} mm to a side and {half_height:g} mm up and down"
-        raise InvalidInputError(f"`at` is ({x:g}, {y:g}), beside the map, which reaches {most} from its centre.")
+        raise InvalidInputError(f"`at` is ({x:g}, {y:g}), outside the map, which reaches {most} from its centre.")
     return x, y
 
 
