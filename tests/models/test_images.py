@@ -198,6 +198,17 @@ def test_what_a_png_holds_beside_its_picture_does_not_matter(processor: UniTouch
             torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1.01 / 255)
 
 
+def test_a_chunk_whose_kind_is_damaged_is_not_left_out(tmp_path: Path) -> None:
+    """Without its palette or transparency, a picture would be another one."""
+    palette = Image.fromarray(PICTURE).quantize(16)
+    palette.info["transparency"] = 0
+    whole = encoded("png", palette)
+    for kind, damaged in ((b"PLTE", b"pLTE"), (b"tRNS", b"tRNs")):
+        (tmp_path / "damaged.png").write_bytes(whole.replace(kind, damaged))
+        with pytest.raises(InvalidInputError, match="cannot be read as an image"):
+            load_images("touch", tmp_path / "damaged.png")
+
+
 def test_a_png_is_turned_as_its_texts_say(processor: UniTouchProcessor, tmp_path: Path) -> None:
     """Those of XMP, by EXIF's table of orientations: 6 has the first row at the right."""
     xmp = b'XML:com.adobe.xmp\0\0\0\0\0<x tiff:Orientation="6"/>'

@@ -111,12 +111,13 @@ def _open_png(content: bytes) -> Image.Image:
         data = content[place + 8 : place + 8 + length]
         chunk = content[place : place + 12 + length]
         place += len(chunk)
-        if kind == b"iCCP" and len(data) == length:
-            compressed = data.partition(b"\0")[2][1:]
+        whole = chunk[8 + length :] == zlib.crc32(kind + data).to_bytes(4)
+        keyword, _, compressed = data.partition(b"\0")
+        if not whole or kind in PNG_CHUNKS or (kind in PNG_TEXTS and keyword in ORIENTED_TEXTS):
+            kept.append(chunk)  # Pillow refuses what is not whole
+        elif kind == b"iCCP":
             with suppress(zlib.error):  # a broken profile is left out
-                profile = zlib.decompressobj().decompress(compressed, MOST_PROFILE)
-        elif kind in PNG_CHUNKS or (kind in PNG_TEXTS and data.partition(b"\0")[0] in ORIENTED_TEXTS):
-            kept.append(chunk)
+                profile = zlib.decompressobj().decompress(compressed[1:], MOST_PROFILE)
     image = Image.open(io.BytesIO(b"".join(kept)))
     if profile:
         image.info["icc_profile"] = profile
