@@ -27,8 +27,9 @@ def add(name: str, sentence: str) -> None:
 
 
 add("image_text", "Binds pictures and captions to each other: the joint space.")
-add("audio", "Binds sounds to pictures.")
 add("touch", "Binds touches to pictures.")
+add("texture", "Adds to pictures and touches what a network trained on photos says of their texture.")
+add("audio", "Binds sounds to pictures.")
 add("image_vae", "Learns the autoencoder of pictures.")
 add("unclip", "Learns to draw pictures from embeddings of pictures.")
 add("touch_vae", "Learns the autoencoder of touches.")

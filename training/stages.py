@@ -34,14 +34,15 @@ from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 STAGES: dict[str, dict[str, str]] = {
     "image_text": {},
-    "audio": {"joint": "image_text"},
-    "touch": {"joint": "audio"},
+    "touch": {"joint": "image_text"},
+    "texture": {"joint": "touch"},
+    "audio": {"joint": "texture"},
     "image_vae": {},
-    "unclip": {"joint": "image_text", "vae": "image_vae"},
+    "unclip": {"joint": "texture", "vae": "image_vae"},
     "touch_vae": {"joint": "touch"},
-    "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
-    "language_model": {"joint": "image_text"},
-    "touch_llm": {"joint": "image_text", "llama": "language_model"},
+    "touch_ldm": {"joint": "texture", "vae": "touch_vae"},
+    "language_model": {"joint": "texture"},
+    "touch_llm": {"joint": "texture", "llama": "language_model"},
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 

@@ -15,7 +15,7 @@ from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
 from unitouch_gen.training.stages import MODULES, Recipe
 
-NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
+NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data", "data_scanned"})
 
 
 def read_as(name: str, *overrides: str) -> Any:

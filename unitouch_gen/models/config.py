@@ -118,6 +118,8 @@ class UniTouchConfig(PreTrainedConfig):
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
+        texture_width: Hidden units of the `TextureHead`s that add to the embeddings of images and touches; 0 for none, as
+            in the paper.
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
@@ -141,6 +143,7 @@ class UniTouchConfig(PreTrainedConfig):
     projection_dim: int = 1024
     sensors: list[str] | tuple[str, ...] = ()
     sensor_tokens: int = 5
+    texture_width: int = 0
     prototype_size: int = 224
     sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
@@ -158,6 +161,7 @@ class UniTouchConfig(PreTrainedConfig):
             raise InvalidInputError(f"`vision_config` or `text_config`: {error.__cause__}") from error
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
+        check_integer("texture_width", self.texture_width, 0)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30)
         for name in ("vision", "text", "touch", "audio"):

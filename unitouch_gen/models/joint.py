@@ -28,6 +28,7 @@ from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, rea
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, local_mean, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
+from unitouch_gen.models.texture import TextureHead, TextureTrunk
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 from unitouch_gen.saving import saved_whole
 
@@ -39,6 +40,8 @@ MODULES: dict[str, tuple[str, ...]] = {  # sub-modules of each modality; also th
     "audio": ("audio_model",),
     "touch": ("touch_model", "sensor_bank"),
 }
+TRUNK = "texture_trunk"  # what image and touch share where the config has a `texture_width`
+HEADS = {"image": "image_texture", "touch": "touch_texture"}  # and what each has of its own
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"  # why a model abstains from naming a touch
 
@@ -46,7 +49,15 @@ _READING = threading.Lock()  # held while an encoder is read: threads that share
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
-    """The `MODULES` of a modality: CLIP for image and text, `UniTouchViT` for audio and touch."""
+    """The modules of a modality: CLIP for image and text, `UniTouchViT` for audio and touch; perhaps texture."""
+    modules = _make_transformers(config, modality)
+    if config.texture_width and modality in HEADS:
+        modules[HEADS[modality]] = TextureHead(config.texture_width, config.projection_dim)
+        modules[TRUNK] = TextureTrunk()
+    return modules
+
+
+def _make_transformers(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
     if modality == "image":
         stemmed = getattr(config.vision_config, "stem", "patch") == "residual"
         kind: Any = StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection
@@ -84,6 +95,9 @@ class UniTouchModel(PreTrainedModel):
     audio_model: UniTouchViT
     touch_model: UniTouchViT
     sensor_bank: SensorBank
+    texture_trunk: TextureTrunk
+    image_texture: TextureHead
+    touch_texture: TextureHead
 
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
         super().__init__(config)
@@ -122,14 +136,17 @@ class UniTouchModel(PreTrainedModel):
         touch_model, sensor_bank = self.load("touch")
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
-        patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
-        return sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids), patches
+        pixels = pixel_values.to(touch_model.projection.weight)
+        patches = touch_model.stem(pixels)
+        features = sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids)
+        return self.add_texture("touch", features, pixels), patches
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
         """Image embeddings (B, D) of pixel values (B, 3, S, S) from `UniTouchProcessor.images`."""
         (vision_model,) = self.load("image")
-        return vision_model(pixel_values=pixel_values.to(vision_model.visual_projection.weight)).image_embeds
+        pixels = pixel_values.to(vision_model.visual_projection.weight)
+        return self.add_texture("image", vision_model(pixel_values=pixels).image_embeds, pixels)
 
     @apply_forward_hook
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
@@ -150,6 +167,12 @@ class UniTouchModel(PreTrainedModel):
         every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
         embeds = F.normalize(audio_model(every_clip), dim=-1)
         return embeds.unflatten(0, input_values.shape[:2]).mean(dim=1)
+
+    def add_texture(self, modality: str, features: Tensor, pixel_values: Tensor) -> Tensor:
+        """Features (B, D) of a transformer with what the texture of the images adds, if the model knows of texture."""
+        if not self.config.texture_width:
+            return features
+        return features + getattr(self, HEADS[modality])(self.texture_trunk(denormalise_pixels(pixel_values)))
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
 
@@ -208,10 +231,12 @@ class UniTouchModel(PreTrainedModel):
         return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
-        """Builds a modality's encoder with random weights, replacing any existing one."""
+        """Builds a modality's encoder with random weights, replacing any existing one; a trunk that is there stays."""
         modules = make_modules(self.config, modality)
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
+        if TRUNK in self._modules:
+            modules.pop(TRUNK, None)
         self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
