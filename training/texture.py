@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from unitouch_gen.evaluation.contacts import float_pixels, image_embeddings, in_batches
 from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.joint import HEADS, TRUNK, stored_tensors
-from unitouch_gen.models.texture import TextureHead, TextureTrunk
+from unitouch_gen.models.joint import stored_tensors
+from unitouch_gen.models.texture import Texture, TextureHead, TextureTrunk
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.losses import symmetric_info_nce
@@ -27,6 +27,7 @@ from unitouch_gen.training.touch import fit_distance
 from unitouch_gen.weights import JOINT
 from unitouch_gen.world import MATERIAL_NAMES
 
+TRUNK = "vision_model.texture.trunk."  # prefix of its tensors in a joint space
 TEMPLATES = ("{}", "this looks like {}", "this feels like {}")
 
 
@@ -62,7 +63,7 @@ class TextureObjective(nn.Module):
 
     def __init__(self, model: UniTouchModel, losses: TextureLosses, names: Tensor):
         super().__init__()
-        self.image, self.touch = model.image_texture, model.touch_texture
+        self.image, self.touch = model.vision_model.texture.head, model.touch_model.texture.head
         self.losses, self.temperature, self.names = losses, model.config.temperature, names
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
@@ -102,13 +103,14 @@ def name_embeddings(model: UniTouchModel, processor: Any) -> Tensor:
 
 
 def add_texture(model: UniTouchModel, settings: TextureSettings) -> None:
-    """Gives a joint space heads that add nothing yet, and the trunk of another one."""
+    """Gives the encoders of image and touch the trunk of another joint space, and heads that add nothing yet."""
     tensors = stored_tensors(settings.trunk)
-    trunk = TextureTrunk()
-    trunk.load_state_dict({name: tensors[f"{TRUNK}.{name}"].float() for name in trunk.state_dict()})
-    setattr(model, TRUNK, trunk)
-    for head in HEADS.values():
-        setattr(model, head, TextureHead(settings.width, model.config.projection_dim))
+    for encoder in (model.vision_model, model.touch_model):
+        encoder.texture = Texture(settings.width, model.config.projection_dim)
+        trunk = encoder.texture.trunk
+        trunk.load_state_dict({name: tensors[TRUNK + name].float() for name in trunk.state_dict()})
+    for config in (model.config.vision_config, model.config.touch_config):
+        config.texture_width = settings.width
 
 
 def touch_embeddings(stage: Stage, model: UniTouchModel, name: str, splits: list[Contacts]) -> Tensor:
@@ -151,17 +153,17 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
         "second_embeds": touch_embeddings(stage, model, "second", splits),
     }
     add_texture(model, recipe.model)
+    pictures, touches = model.vision_model.texture, model.touch_model.texture
     for name in ("image", "touch", "second"):
-        columns[f"{name}_statistics"] = statistics_of(stage, model.texture_trunk, name, splits)
-    model.image_texture.fit(columns["image_statistics"])
-    model.touch_texture.fit(torch.cat([columns["touch_statistics"], columns["second_statistics"]]))
+        columns[f"{name}_statistics"] = statistics_of(stage, pictures.trunk, name, splits)
+    pictures.head.fit(columns["image_statistics"])
+    touches.head.fit(torch.cat([columns["touch_statistics"], columns["second_statistics"]]))
 
     objective = TextureObjective(model, recipe.objective, name_embeddings(model, stage.processor))
     stage.fit(objective, ArrayDataset(**columns))
-    model.config.texture_width = recipe.model.width
     with torch.no_grad():
-        pictures = columns["image_embeds"] + model.image_texture(columns["image_statistics"])
-    model.config.embedding_norm = pictures.norm(dim=1).mean().item()
+        embeds = columns["image_embeds"] + pictures.head(columns["image_statistics"])
+    model.config.embedding_norm = embeds.norm(dim=1).mean().item()
     fit_distance(model, splits)
     with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
         model.save_pretrained(folder)

@@ -14,10 +14,9 @@ from pydantic import NonNegativeFloat, NonNegativeInt, model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import float_pixels, in_batches
 from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.joint import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training import batches
@@ -78,8 +77,6 @@ class TouchEncoder(nn.Module):
     def __init__(self, model: UniTouchModel, weights: LossWeights):
         super().__init__()
         self.transformer, self.bank = model.touch_model, model.sensor_bank
-        self.texture = model.touch_texture if model.config.texture_width else None
-        self.frozen = (model.texture_trunk,) if self.texture is not None else ()  # no module of what is trained
         config: Any = model.config.touch_config
         self.grid = config.grid
         self.reader = nn.Linear(config.projection_dim, len(ATTRIBUTES)) if weights.attributes else None
@@ -90,19 +87,18 @@ class TouchEncoder(nn.Module):
 
         Those of sensors below 0 have no tokens.
         """
-        tokens = self.bank.encode(self._tokens, pixel_values, sensor_ids)
+        tokens = self.bank.encode(self._tokens, self.transformer.stem(pixel_values), sensor_ids)
         tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
         patches = self.transformer.norm(tokens[:, 1:]).transpose(1, 2).unflatten(2, self.grid)
         embeds = self.transformer.embed(tokens)
-        for trunk in self.frozen:
-            statistics = trunk.to(pixel_values.device)(denormalise_pixels(pixel_values))
-            embeds = embeds + self.texture(statistics)
+        if self.transformer.texture is not None:
+            embeds = embeds + self.transformer.texture(pixel_values)
         return embeds, F.adaptive_avg_pool2d(patches.float(), CELLS)
 
-    def _tokens(self, pixel_values: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """Tokens of class and patches, (B, 1 + patches, width)."""
-        x, patches = self.transformer.tokens(pixel_values, prefix), self.grid[0] * self.grid[1]
-        return torch.cat([x[:, :1], x[:, -patches:]], dim=1)
+    def _tokens(self, stemmed: Tensor, prefix: Tensor | None = None) -> Tensor:
+        """Tokens of class and patches, (B, 1 + patches, width), of the stem's output."""
+        tokens, patches = self.transformer.tokens(stemmed, prefix), self.grid[0] * self.grid[1]
+        return torch.cat([tokens[:, :1], tokens[:, -patches:]], dim=1)
 
 
 class TouchObjective(nn.Module):
@@ -150,13 +146,10 @@ def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
 def start_from(model: UniTouchModel, folder: Path) -> None:
     """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them."""
     with reading("init", folder):
-        begun = UniTouchModel.from_pretrained(folder)
-        transformer, bank = begun.load("touch")
+        transformer, bank = UniTouchModel.from_pretrained(folder).load("touch")
     try:
         model.touch_model.load_state_dict(transformer.state_dict())
-        if model.config.texture_width:
-            model.touch_texture.load_state_dict(begun.touch_texture.state_dict())
-    except (RuntimeError, AttributeError) as error:
+    except RuntimeError as error:
         why = str(error).splitlines()[-1].strip()
         raise InvalidInputError(f"`init` is {str(folder)!r}, which does not fit the joint space: {why}") from error
     for name in set(bank.names) & set(model.sensor_bank.names):
@@ -185,13 +178,6 @@ def set_prototypes(model: UniTouchModel, splits: list[Contacts], reaches: bool =
             own = torch.from_numpy(np.concatenate([spread(part) for part in parts])) / 255
             distances = layout_distances(own, model.sensor_bank.prototype(name))
             model.config.sensor_reaches[name] = distances.quantile(1.0 - ABSTAINED / 2).item()
-
-
-@torch.no_grad()
-def texture_statistics(model: UniTouchModel, splits: list[Contacts]) -> Tensor:
-    """Texture statistics (M, 528) of some touches of all sensors."""
-    touches = np.concatenate([spread(split.touch) for split in splits])
-    return in_batches(len(touches), lambda rows: model.texture_trunk(float_pixels(touches[rows])), size=32)
 
 
 def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> Gaussians:
@@ -253,8 +239,8 @@ def main(stage: Stage, recipe: TouchRecipe) -> None:
     model.add("touch")
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
-    elif model.config.texture_width:
-        model.touch_texture.fit(texture_statistics(model, splits))
+    elif model.touch_model.texture is not None:
+        model.touch_model.texture.load_state_dict(model.vision_model.texture.state_dict())
     set_prototypes(model, splits, reaches=bool(recipe.objective.pairs))
 
     dataset = ArrayDataset(

@@ -35,38 +35,40 @@ def test_the_trunk_is_the_published_network(size: int) -> None:
     torch.testing.assert_close(statistics, torch.cat(described, dim=1), rtol=1e-3, atol=1e-3)
 
 
-def test_heads_add_nothing_until_they_are_trained(tmp_path: Path) -> None:
-    pixels, model = torch.randn(2, 3, 32, 32), UniTouchModel(joint_config(clip_tokenizer(), texture_width=8)).eval()
-    transformer = model.vision_model(pixel_values=pixels).image_embeds
-    assert torch.equal(model.get_image_features(pixels), transformer)
-    torch.nn.init.normal_(model.image_texture.project.weight)
-    torch.nn.init.normal_(model.touch_texture.project.weight)
-    added = model.get_image_features(pixels) - transformer
-    statistics = model.texture_trunk(denormalise_pixels(pixels))
-    torch.testing.assert_close(added, model.image_texture(statistics), rtol=1e-4, atol=1e-4)
-    ids = torch.tensor([-1, -1])
-    plain = model.touch_model(pixels)
-    added = model.get_touch_features(pixels, ids) - plain
-    torch.testing.assert_close(added, model.touch_texture(statistics), rtol=1e-4, atol=1e-4)
+def with_texture() -> UniTouchModel:
+    config = joint_config(clip_tokenizer())
+    config = joint_config(
+        clip_tokenizer(),
+        vision_config={**config.vision_config.to_dict(), "stem": "residual", "texture_width": 8},
+        touch_config={**config.touch_config.to_dict(), "texture_width": 8},
+    )
+    return UniTouchModel(config).eval()
+
+
+def test_texture_is_added_to_embeddings(tmp_path: Path) -> None:
+    pixels, ids, model = torch.randn(2, 3, 32, 32), torch.tensor([-1, -1]), with_texture()
+    image, touch = model.vision_model.texture, model.touch_model.texture
+    model.vision_model.texture = model.touch_model.texture = None
+    plain = model.get_image_features(pixels), model.get_touch_features(pixels, ids)
+    model.vision_model.texture, model.touch_model.texture = image, touch
+    assert torch.equal(model.get_image_features(pixels), plain[0])  # the last layer begins at zero
+    torch.nn.init.normal_(image.head.project.weight)
+    found = model.get_image_features(pixels), model.get_touch_features(pixels, ids)
+    statistics = image.trunk(denormalise_pixels(pixels))
+    torch.testing.assert_close(found[0] - plain[0], image.head(statistics), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found[1] - plain[1], touch(pixels), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(model.touch_model(pixels), found[1], rtol=1e-4, atol=1e-4)
+    trained, _ = TouchEncoder(model, LossWeights())(pixels, ids)
+    torch.testing.assert_close(trained, found[1], rtol=1e-4, atol=1e-4)
 
     model.save_pretrained(tmp_path)
     again = UniTouchModel.from_pretrained(tmp_path)
-    assert torch.equal(again.get_image_features(pixels), model.get_image_features(pixels))
-    assert "touch_model" not in again._modules  # image alone was read
-    assert torch.equal(again.get_touch_features(pixels, ids), model.get_touch_features(pixels, ids))
-
-
-def test_training_sees_the_touches_that_the_model_sees() -> None:
-    model = UniTouchModel(joint_config(clip_tokenizer(), texture_width=8)).eval()
-    torch.nn.init.normal_(model.touch_texture.project.weight)
-    pixels, ids = torch.randn(2, 3, 32, 32), torch.tensor([-1, -1])
-    trained, _ = TouchEncoder(model, LossWeights())(pixels, ids)
-    torch.testing.assert_close(trained, model.get_touch_features(pixels, ids), rtol=1e-4, atol=1e-4)
+    assert torch.equal(again.get_image_features(pixels), found[0])
+    assert torch.equal(again.get_touch_features(pixels, ids), found[1])
 
 
 def test_a_trunk_learns_nothing() -> None:
-    model = UniTouchModel(joint_config(clip_tokenizer(), texture_width=8), modalities=("image",))
-    trunk = model.texture_trunk
-    model.add("image")
-    assert model.texture_trunk is trunk
-    assert not any(weight.requires_grad for weight in trunk.parameters())
+    model = with_texture()
+    for encoder in (model.vision_model, model.touch_model):
+        assert not any(weight.requires_grad for weight in encoder.texture.trunk.parameters())
+        assert all(weight.requires_grad for weight in encoder.texture.head.parameters())

@@ -57,6 +57,8 @@ class UniTouchViTConfig(PreTrainedConfig):
         layer_norm_eps: Of all other norms.
         projection_dim: Width D of the joint space.
         patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
+        texture_width: Hidden units of what a network trained on photos adds to the embedding; 0 adds nothing (ViT). See
+            `models.texture`.
     """
 
     model_type = "unitouch_vit"
@@ -76,6 +78,7 @@ class UniTouchViTConfig(PreTrainedConfig):
     layer_norm_eps: float = 1e-6
     projection_dim: int = 1024
     patch_channels: int = 0
+    texture_width: int = 0
 
     def __post_init__(self, **kwargs: Any) -> None:
         check_spelling(UniTouchViTConfig, kwargs)
@@ -84,6 +87,7 @@ class UniTouchViTConfig(PreTrainedConfig):
                      "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
             check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
         check_integer("patch_channels", self.patch_channels, 0)
+        check_integer("texture_width", self.texture_width, 0)
         check_number("mlp_ratio", self.mlp_ratio, 1e-3)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         if self.hidden_size % self.num_attention_heads:
@@ -113,13 +117,11 @@ class UniTouchConfig(PreTrainedConfig):
 
     Args:
         vision_config, text_config: transformers' CLIP configurations. The first may have a `stem`, "patch" or
-            "residual", and behind the latter `patch_channels`, as in `UniTouchViTConfig`.
+            "residual", and behind the latter `patch_channels` and `texture_width`, as in `UniTouchViTConfig`.
         touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
-        texture_width: Hidden units of the `TextureHead`s that add to embeddings of images and touches; 0 for none, as in
-            the paper.
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
@@ -143,7 +145,6 @@ class UniTouchConfig(PreTrainedConfig):
     projection_dim: int = 1024
     sensors: list[str] | tuple[str, ...] = ()
     sensor_tokens: int = 5
-    texture_width: int = 0
     prototype_size: int = 224
     sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
@@ -161,7 +162,6 @@ class UniTouchConfig(PreTrainedConfig):
             raise InvalidInputError(f"`vision_config` or `text_config`: {error.__cause__}") from error
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
-        check_integer("texture_width", self.texture_width, 0)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30)
         for name in ("vision", "text", "touch", "audio"):

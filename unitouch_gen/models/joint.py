@@ -4,7 +4,6 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +27,6 @@ from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, rea
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, local_mean, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
-from unitouch_gen.models.texture import TextureHead, TextureTrunk
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 from unitouch_gen.saving import saved_whole
 
@@ -40,8 +38,6 @@ MODULES: dict[str, tuple[str, ...]] = {  # sub-modules of each modality; also th
     "audio": ("audio_model",),
     "touch": ("touch_model", "sensor_bank"),
 }
-TRUNK = "texture_trunk"  # what image and touch share where the config has a `texture_width`
-HEADS = {"image": "image_texture", "touch": "touch_texture"}  # and what each has of its own
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"  # why a model abstains from naming a touch
 
@@ -49,15 +45,7 @@ _READING = threading.Lock()  # held while an encoder is read: threads that share
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
-    """The modules of a modality: CLIP for image and text, `UniTouchViT` for audio and touch; perhaps texture."""
-    modules = _make_transformers(config, modality)
-    if config.texture_width and modality in HEADS:
-        modules[HEADS[modality]] = TextureHead(config.texture_width, config.projection_dim)
-        modules[TRUNK] = TextureTrunk()
-    return modules
-
-
-def _make_transformers(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
+    """The `MODULES` of a modality: CLIP for image and text, `UniTouchViT` for audio and touch."""
     if modality == "image":
         stemmed = getattr(config.vision_config, "stem", "patch") == "residual"
         kind: Any = StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection
@@ -95,9 +83,6 @@ class UniTouchModel(PreTrainedModel):
     audio_model: UniTouchViT
     touch_model: UniTouchViT
     sensor_bank: SensorBank
-    texture_trunk: TextureTrunk
-    image_texture: TextureHead
-    touch_texture: TextureHead
 
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
         super().__init__(config)
@@ -138,15 +123,20 @@ class UniTouchModel(PreTrainedModel):
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
         pixels = pixel_values.to(touch_model.projection.weight)
         patches = touch_model.stem(pixels)
-        features = sensor_bank.encode(partial(touch_model, stemmed=True), patches, sensor_ids)
-        return self.add_texture("touch", features, pixels), patches
+
+        def encode(patches: Tensor, prefix: Tensor | None) -> Tensor:
+            return touch_model.embed(touch_model.tokens(patches, prefix))
+
+        features = sensor_bank.encode(encode, patches, sensor_ids)
+        if touch_model.texture is not None:
+            features = features + touch_model.texture(pixels)
+        return features, patches
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
         """Image embeddings (B, D) of pixel values (B, 3, S, S) from `UniTouchProcessor.images`."""
         (vision_model,) = self.load("image")
-        pixels = pixel_values.to(vision_model.visual_projection.weight)
-        return self.add_texture("image", vision_model(pixel_values=pixels).image_embeds, pixels)
+        return vision_model(pixel_values=pixel_values.to(vision_model.visual_projection.weight)).image_embeds
 
     @apply_forward_hook
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
@@ -167,12 +157,6 @@ class UniTouchModel(PreTrainedModel):
         every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
         embeds = F.normalize(audio_model(every_clip), dim=-1)
         return embeds.unflatten(0, input_values.shape[:2]).mean(dim=1)
-
-    def add_texture(self, modality: str, features: Tensor, pixel_values: Tensor) -> Tensor:
-        """Features (B, D) of a transformer with what the texture of the images adds, if the model knows of texture."""
-        if not self.config.texture_width:
-            return features
-        return features + getattr(self, HEADS[modality])(self.texture_trunk(denormalise_pixels(pixel_values)))
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
 
@@ -231,12 +215,10 @@ class UniTouchModel(PreTrainedModel):
         return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
-        """Builds a modality's encoder with random weights, replacing any existing one; a trunk that is there stays."""
+        """Builds a modality's encoder with random weights, replacing any existing one."""
         modules = make_modules(self.config, modality)
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
-        if TRUNK in self._modules:
-            modules.pop(TRUNK, None)
         self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:

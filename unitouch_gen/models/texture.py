@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from unitouch_gen.models.images import denormalise_pixels
+
 STAGES = ((16, 3, 1, 1, 1), (24, 3, 2, 6, 2), (40, 5, 2, 6, 2), (80, 3, 2, 6, 3), (112, 5, 1, 6, 3))
 """Channels, kernel, stride, expansion and number of the blocks of each stage."""
 
@@ -82,10 +84,6 @@ class TextureHead(nn.Module):
     """What texture adds to an embedding, (B, 528) -> (B, D): nothing at first, as its last layer begins at zero.
 
     Statistics are brought to the mean and deviation that they have over the training data, which `fit` stores.
-
-    Args:
-        width: Of the hidden layer.
-        projection_dim: D.
     """
 
     mean: Tensor
@@ -108,3 +106,20 @@ class TextureHead(nn.Module):
 
     def forward(self, statistics: Tensor) -> Tensor:
         return self.project(F.gelu(self.hidden((statistics - self.mean) / self.deviation)))
+
+
+class Texture(nn.Module):
+    """Trunk and head: what the texture of images adds to their embeddings, (B, 3, H, W) normalised -> (B, D).
+
+    Args:
+        width: Hidden units of the head.
+        projection_dim: D.
+    """
+
+    def __init__(self, width: int, projection_dim: int):
+        super().__init__()
+        self.trunk = TextureTrunk()
+        self.head = TextureHead(width, projection_dim)
+
+    def forward(self, pixel_values: Tensor) -> Tensor:
+        return self.head(self.trunk(denormalise_pixels(pixel_values)))

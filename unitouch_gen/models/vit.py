@@ -19,6 +19,7 @@ from transformers.models.clip.modeling_clip import CLIPVisionEmbeddings
 from unitouch_gen.models.config import UniTouchViTConfig
 from unitouch_gen.models.images import local_mean
 from unitouch_gen.models.relief import RELIEF_CHANNELS, BesideRelief
+from unitouch_gen.models.texture import Texture
 
 
 class StreamNorm(nn.LayerNorm):
@@ -135,13 +136,15 @@ class UniTouchViT(nn.Module):
         self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
         self.patch_projection = PatchProjection(config, rows * columns) if config.patch_channels else None
+        self.texture = Texture(config.texture_width, config.projection_dim) if config.texture_width else None
 
-    def forward(self, pixels: Tensor, prefix: Tensor | None = None, stemmed: bool = False) -> Tensor:
-        """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W), or of the stem's output if `stemmed`.
+    def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
+        """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W).
 
         The prefix, (B, L, width), is put between class token and patches; it carries no position.
         """
-        return self.embed(self.tokens(pixels, prefix, stemmed))
+        embeds = self.embed(self.tokens(self.stem(pixels), prefix))
+        return embeds if self.texture is None else embeds + self.texture(pixels)
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Embeddings (B, D) of the blocks' output, see `tokens`, which may lack the prefix."""
@@ -150,9 +153,12 @@ class UniTouchViT(nn.Module):
             embeds = embeds + self.patch_projection(tokens[:, 1 - self.position.shape[1] :])
         return embeds
 
-    def tokens(self, pixels: Tensor, prefix: Tensor | None = None, stemmed: bool = False) -> Tensor:
-        """Output of the blocks, (B, 1 + L + patches, width): class token, prefix, patches by rows; see `forward`."""
-        x = (pixels if stemmed else self.stem(pixels)).flatten(2).transpose(1, 2)  # (B, patches, width)
+    def tokens(self, patches: Tensor, prefix: Tensor | None = None) -> Tensor:
+        """Output of the blocks, (B, 1 + L + patches, width), of the stem's, (B, width, h, w).
+
+        In order: class token, prefix, patches by rows; see `forward`.
+        """
+        x = patches.flatten(2).transpose(1, 2)  # (B, patches, width)
         if self.stem_norm is not None:
             x = self.stem_norm(x)
         x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
@@ -212,8 +218,8 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
     """`CLIPVisionModelWithProjection` with patches made by residual convolutions (Xiao et al., 2021).
 
     Args:
-        config: With a `patch_size` that is a power of two and divides `image_size`, and perhaps `patch_channels`, as
-            `UniTouchViTConfig` has it.
+        config: With a `patch_size` that is a power of two and divides `image_size`, and perhaps `patch_channels` and
+            `texture_width`, as `UniTouchViTConfig` has them.
     """
 
     def __init__(self, config: CLIPVisionConfig):
@@ -223,9 +229,14 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
         if getattr(config, "patch_channels", 0):
             patches = self.vision_model.embeddings.num_patches
             self.patch_projection = PatchProjection(config, patches).apply(initialise)
+        self.texture: Texture | None = None
+        if getattr(config, "texture_width", 0):
+            self.texture = Texture(config.texture_width, config.projection_dim)
 
     def forward(self, pixel_values: Tensor, **options: Any) -> Any:
         made: Any = super().forward(pixel_values, **options)
         if self.patch_projection is not None:
             made.image_embeds = made.image_embeds + self.patch_projection(made.last_hidden_state[:, 1:])
+        if self.texture is not None:
+            made.image_embeds = made.image_embeds + self.texture(pixel_values)
         return made
