@@ -11,16 +11,17 @@ ARGS ?=
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
-STAGES := image_text audio touch image_vae unclip touch_vae touch_ldm language_model touch_llm
-JOINT := --joint $(RUNS)/image_text/model
-SOUNDED := --joint $(RUNS)/audio/model
+STAGES := image_text touch texture audio image_vae unclip touch_vae touch_ldm language_model touch_llm
+PICTURES := --joint $(RUNS)/image_text/model
+JOINT := --joint $(RUNS)/texture/model
 # Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
 STAGE_captions := image_text
 STAGE_touch_pairs := touch
-TAKES_touch_pairs := $(SOUNDED) --recipe touch_pairs
 TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
+TAKES_touch_pairs := $(PICTURES) --recipe touch_pairs
+TAKES_touch := $(PICTURES) --init $(RUNS)/touch_pairs/model
+TAKES_texture := --joint $(RUNS)/touch/model
 TAKES_audio := $(JOINT)
-TAKES_touch := $(SOUNDED) --init $(RUNS)/touch_pairs/model
 TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
 TAKES_touch_vae := --joint $(RUNS)/touch/model
 TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
@@ -74,10 +75,11 @@ $(RECORDS): $(RUNS)/%/record.json: | $(VENV)/.installed
 	$(BIN)/python -m unitouch_gen.training $(or $(STAGE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
-$(foreach stage,audio unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(foreach stage,audio unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/texture/record.json
 $(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
-$(RUNS)/touch_pairs/record.json: | $(RUNS)/audio/record.json
+$(RUNS)/touch_pairs/record.json: | $(RUNS)/image_text/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
+$(RUNS)/texture/record.json: | $(RUNS)/touch/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_vae/record.json: | $(RUNS)/touch/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json

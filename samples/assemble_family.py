@@ -32,7 +32,7 @@ SCHEDULERS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 PLACES = {
-    "touch": "joint", "image_vae": "image-vae", "unclip": "touch-to-image", "touch_vae": "touch-vae",
+    "audio": "joint", "image_vae": "image-vae", "unclip": "touch-to-image", "touch_vae": "touch-vae",
     "touch_ldm": "x-to-touch", "touch_llm": "touch-to-text",
 }  # fmt: skip
 """Folders of a family, by the stages whose models they hold."""

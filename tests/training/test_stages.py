@@ -41,8 +41,9 @@ UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.a
 SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 SETTINGS: dict[str, tuple[str, ...]] = {
     "image_text": (*ALONE, *SPACED, "objective.views=1.0", "sampler.sigma=0.75", "sampler.group=2"),
-    "audio": (),
     "touch": (),
+    "texture": ("model.width=16",),
+    "audio": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),
     "unclip": (*UNET, "model.projection_class_embeddings_input_dim=32"),
     "touch_vae": (*ALONE, *VAE, "augment.crop=null"),
@@ -50,6 +51,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("bridge.intermediate_size=24",),
 }  # fmt: skip
+NOT_LEARNED = ("known", "prototypes", "mean", "deviation")
 FROZEN = defaultdict(set, touch_llm={"language_model"})
 """Parts of an objective that are not trained."""
 
@@ -83,7 +85,7 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         first, last = (load_file(folder / "model.safetensors") for folder in checkpoints_in(runs / name))
         still = {key for key, value in last.items() if torch.equal(value, first[key])}
         if name not in ("unclip", "touch_ldm"):  # group norms of single pixels learn nothing
-            assert {key.split(".")[0] for key in still if not key.endswith(("known", "prototypes"))} <= FROZEN[name]
+            assert {key.split(".")[0] for key in still if not key.endswith(NOT_LEARNED)} <= FROZEN[name]
 
 
 @pytest.mark.parametrize("name", ["touch", "unclip", "language_model", "touch_llm"])
