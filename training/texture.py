@@ -35,7 +35,7 @@ class TextureSettings(Settings):
     """Sizes of the heads, and whose trunk they stand on."""
 
     width: PositiveInt
-    trunk: Path = JOINT  # a joint space that has one
+    trunk: str | None = None  # folder of a joint space that has one; the built-in one if left out
 
 
 class TextureLosses(Settings):
@@ -104,7 +104,7 @@ def name_embeddings(model: UniTouchModel, processor: Any) -> Tensor:
 
 def add_texture(model: UniTouchModel, settings: TextureSettings) -> None:
     """Gives the encoders of image and touch the trunk of another joint space, and heads that add nothing yet."""
-    tensors = stored_tensors(settings.trunk)
+    tensors = stored_tensors(Path(settings.trunk) if settings.trunk else JOINT)
     for encoder in (model.vision_model, model.touch_model):
         encoder.texture = Texture(settings.width, model.config.projection_dim)
         trunk = encoder.texture.trunk
