@@ -29,7 +29,8 @@ def main() -> None:
 
     names = {"image": list(examples("image")), "touch": list(examples())}
     if arguments.pipeline == "stylization":
-        names["touch"] = ["wood", "tile", "brick", "gravel"]  # one for each photo
+        names["image"] = ["brick", "rock", "natural_fabric", "sand"]
+        names["touch"] = ["wood", "tile", "rock", "metal"]  # one for each photo
     else:
         del names["touch" if arguments.pipeline.startswith("x-to-touch") else "image"]
     inputs = {modality: [example(name, modality) for name in of] for modality, of in names.items()}

@@ -10,7 +10,7 @@ from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 from torch import Tensor
 
-from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, Scene, World
 from unitouch_gen.world.draws import SHAPES
 
 Tile = Image.Image | Tensor | None
@@ -96,11 +96,24 @@ def save(picture: Image.Image, output: Path) -> None:
 
 def flat_contacts(world: World, number: int = 0) -> tuple[list[int], list[int], list[int]]:
     """Material, object and contact of one firm contact of each material with a flat face of it, of objects that nothing
-    was trained on; other numbers pick others."""
+    was trained on; other numbers pick others.
+
+    Of a world of drawn and scanned objects, every second material is scanned, as far as there are scans.
+    """
     first, chosen = FIRST_OBJECT["test"], []
     objects = torch.arange(first, first + 40 + 20 * number)
     for material in range(len(MATERIAL_NAMES)):
         draws = world.draw(torch.full_like(objects, material), objects, torch.zeros_like(objects))
         flat = draws.shape == list(SHAPES).index("flat")
-        chosen.append(int(objects[flat & (draws.indentation_depth > 0.5)][number]))
+        scanned = draws.surface >= 0
+        wanted = scanned if bool(scanned.all()) or (material % 2 == 0 and bool(scanned.any())) else ~scanned
+        chosen.append(int(objects[flat & wanted & (draws.indentation_depth > 0.5)][number]))
     return list(range(len(MATERIAL_NAMES))), chosen, [0] * len(chosen)
+
+
+def labels_of(scene: Scene) -> list[str]:
+    """Names of the materials of a scene, and which of them are scanned."""
+    return [
+        name if surface is None else f"{name}, scanned"
+        for name, surface in zip(MATERIAL_NAMES, scene.surface, strict=True)
+    ]

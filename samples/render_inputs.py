@@ -15,6 +15,7 @@ from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Scene, Worl
 
 INPUTS = Path(__file__).parent / "inputs"
 WORLD = World()
+SCANS = World(scanned=1.0)
 
 # (sensor, material, which of its held-out objects): one of each sensor at least, and two of sensors that nobody knows.
 TOUCHES = (
@@ -28,6 +29,9 @@ TOUCHES = (
     ("drawn_9", "tree", 0),
 )
 
+# Of scanned surfaces: (sensor, material, which), a touch and a photo of the same place.
+SCANNED = (("gelsight", "rock", 0), ("gelsight_r15", "metal", 0), ("gelsight", "concrete", 1), ("gelsight", "sand", 2))
+
 PHOTOS = (("brick", 1), ("wood", 1), ("gravel", 1), ("natural fabric", 1))
 SOUNDS = (("metal", 0), ("glass", 0), ("wood", 0), ("gravel", 0))
 
@@ -37,12 +41,12 @@ def to_picture(pixels) -> Image.Image:
     return Image.fromarray((pixels.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
-def contact(material: str, which: int, modality: str, sensor: str = "gelsight") -> Scene:
+def contact(material: str, which: int, modality: str, sensor: str = "gelsight", world: World = WORLD) -> Scene:
     """One modality of one contact with a held-out object."""
     row = MATERIAL_NAMES.index(material)
-    name = ([part[row]] for part in flat_contacts(WORLD, which))
+    name = ([part[row]] for part in flat_contacts(world, which))
     known = SENSORS[sensor] if sensor in SENSORS else draw_sensor(0, int(sensor.removeprefix("drawn_")))
-    return WORLD.render(*name, modalities=(modality,), sensors=(known,))
+    return world.render(*name, modalities=(modality,), sensors=(known,))
 
 
 def coin(side: int = 256) -> Image.Image:
@@ -70,6 +74,12 @@ def main() -> None:
         file = INPUTS / f"{sensor.split('_')[0] if sensor not in SENSORS else sensor}_{material}.png"
         to_picture(contact(material, which, "touch", sensor).touch[sensor][0]).save(file)
         print(file)
+    for sensor, material, which in SCANNED:
+        touched = INPUTS / f"{sensor}_{material}.png"
+        to_picture(contact(material, which, "touch", sensor, SCANS).touch[sensor][0]).save(touched)
+        photographed = INPUTS / "photos" / f"{material}.png"
+        to_picture(contact(material, which, "image", world=SCANS).image[0]).save(photographed)
+        print(touched, photographed, sep="\n")
     for material, which in PHOTOS:
         file = INPUTS / "photos" / f"{material.replace(' ', '_')}.png"
         to_picture(contact(material, which, "image").image[0]).save(file)

@@ -15,13 +15,19 @@ import unitouch_gen
 from drawing import draw_grid, save
 
 INPUTS = Path(__file__).parent / "inputs"
+# Half of them are of scanned surfaces.
+PHOTOS = [INPUTS / "photos" / f"{name}.png" for name in ("brick", "rock", "natural_fabric", "sand")]
+TOUCHES = [
+    INPUTS / f"{name}.png"
+    for name in ("digit_wood", "gelsight_rock", "gelsight_tile", "gelsight_r15_metal", "gelsight_brick")
+]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/stylization.png"))
-    parser.add_argument("--photos", type=Path, nargs="+", default=sorted((INPUTS / "photos").glob("*.png")))
-    parser.add_argument("--touches", type=Path, nargs="+", default=sorted(INPUTS.glob("*.png"))[:5])
+    parser.add_argument("--photos", type=Path, nargs="+", default=PHOTOS)
+    parser.add_argument("--touches", type=Path, nargs="+", default=TOUCHES)
     parser.add_argument("--touch-weight", type=float, default=0.7, help="share of the touch")
     parser.add_argument(
         "--layout", type=int, default=14, help="cells along a side of the grid on which the photo is held"

@@ -1,4 +1,4 @@
-"""Draws one row for each material: a touch, the true picture, and pictures generated from the touch.
+"""Draws one row for each material, drawn or scanned: a touch, the true picture, and pictures generated from the touch.
 
 python samples/touch_to_image_grid.py
 python samples/touch_to_image_grid.py --output samples/pictures/touch_to_image.jpg    # the README's
@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 import unitouch_gen
-from drawing import draw_grid, flat_contacts, save
+from drawing import draw_grid, flat_contacts, labels_of, save
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
 
 
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=4, help="pictures generated from each touch")
     arguments = parser.parse_args()
 
-    world, count = World(), len(MATERIAL_NAMES)
+    world, count = World(scanned=0.5), len(MATERIAL_NAMES)
     names = flat_contacts(world, arguments.object)
     scene = world.render(*names, modalities=("image", "touch"), sensors=(arguments.sensor,))
     touches = scene.touch[arguments.sensor]
@@ -36,7 +36,7 @@ def main() -> None:
 
     grid = draw_grid(
         [[touches[row], scene.image[row], *pictures[row]] for row in range(count)],
-        labels=MATERIAL_NAMES,
+        labels=labels_of(scene),
         titles=["touch", "true picture", *["generated"] * arguments.pictures],
         blocks=2,
     )

@@ -1,5 +1,7 @@
 """Draws one row for each material: a photo, the true touch, and touches imagined from photo, caption and sound.
 
+Every second material is scanned, as far as there are scans.
+
 python samples/x_to_touch_grid.py
 python samples/x_to_touch_grid.py --output samples/pictures/x_to_touch.jpg    # the README's
 """
@@ -10,7 +12,7 @@ from pathlib import Path
 import torch
 
 import unitouch_gen
-from drawing import draw_grid, flat_contacts, save
+from drawing import draw_grid, flat_contacts, labels_of, save
 from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, World
 
 TITLES = ("photo", "true touch", "from photo", "from caption", "from sound")
@@ -24,7 +26,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
-    world, count = World(), len(MATERIAL_NAMES)
+    world, count = World(scanned=0.5), len(MATERIAL_NAMES)
     names = flat_contacts(world, arguments.object)
     scene = world.render(*names, modalities=("image", "touch", "audio", "text"), sensors=(arguments.sensor,))
     pipe = unitouch_gen.tiny("x-to-touch")
@@ -41,7 +43,7 @@ def main() -> None:
         imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio]),
     ]
     rows = list(zip(*columns, strict=True))
-    save(draw_grid(rows, labels=MATERIAL_NAMES, titles=TITLES, blocks=2), arguments.output)
+    save(draw_grid(rows, labels=labels_of(scene), titles=TITLES, blocks=2), arguments.output)
 
 
 if __name__ == "__main__":

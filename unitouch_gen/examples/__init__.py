@@ -1,5 +1,7 @@
 """Touches, photos and sounds of objects that the built-in models never saw, and a height map, to try calls with.
 
+Those of rock, metal, concrete and sand are of scanned surfaces.
+
 `samples/inputs` is a link to this folder, which `samples/render_inputs.py` renders.
 """
 
