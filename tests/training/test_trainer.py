@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from platform import machine
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, shuffled_indices
 from unitouch_gen.training.checkpoints import checkpoints_in
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, rate_at
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, precision_here, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
@@ -241,3 +242,11 @@ def test_a_loss_that_is_not_finite_stops_the_run_at_its_last_checkpoint(tmp_path
     with pytest.raises(NonFiniteError, match=r"loss at step 7 is nan; its samples are \[7\]"):
         trainer.fit()
     assert [folder.name for folder in checkpoints_in(tmp_path)] == ["step-00000005"]
+
+
+@pytest.mark.skipif(not Path("/proc/cpuinfo").is_file() or machine() != "x86_64", reason="the flags are told elsewhere")
+def test_bfloat16_is_left_to_cpus_that_compute_in_it() -> None:
+    flags = Path("/proc/cpuinfo").read_text()
+    expected = "bf16" if "avx512_bf16" in flags or "amx_bf16" in flags else "no"
+    assert precision_here("bf16") == expected
+    assert precision_here("no") == "no"
