@@ -56,20 +56,26 @@ class SamplerSettings(Settings):
 
 
 def in_batch_indices(
-    step: int, sizes: Sequence[int], batch_size: int, settings: SamplerSettings, seed: int = 0,
+    step: int,
+    sizes: Sequence[int],
+    batch_size: int,
+    settings: SamplerSettings,
+    seed: int = 0,
     near: np.ndarray | None = None,
-) -> list[int]:  # fmt: skip
+) -> list[int]:
     """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others (Eq. 4).
 
     Indices are into the concatenation of the data sets, of some `sizes`. Groups are of an example and others of those
     nearest to it, by vectors `near` (N, D) of all examples.
     """
-    rng, total = np.random.default_rng((seed, step)), int(sum(sizes))
+    rng = np.random.default_rng((seed, step))
+    total = int(sum(sizes))
     count = share_of(settings.sigma, batch_size, len(sizes))
     if count is None:
         return _draw(rng, total, batch_size).tolist()
     chosen = int(rng.choice(len(sizes), p=np.asarray(sizes) / total))
-    start, size = int(sum(sizes[:chosen])), int(sizes[chosen])
+    start = int(sum(sizes[:chosen]))
+    size = int(sizes[chosen])
     if near is None or settings.group == 1 or size <= 4 * settings.group:
         inside = _draw(rng, size, count)
     else:

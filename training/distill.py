@@ -32,7 +32,8 @@ from unitouch_gen.training.losses import denoising_loss, predict
 from unitouch_gen.training.recipe import Arguments, Settings, build, read, read_recipe
 from unitouch_gen.training.stages import Recipe, Stage
 
-STUDENT, CRITIC = "student", "critic"
+STUDENT = "student"
+CRITIC = "critic"
 """Names of the two sets of LoRA layers."""
 
 Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
@@ -59,13 +60,21 @@ class DistillObjective(nn.Module):
     """
 
     def __init__(
-        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, conditioned: Conditioned,
-        settings: DistillSettings, guidance_scale: float,
-    ):  # fmt: skip
+        self,
+        unet: UNet2DConditionModel,
+        scheduler: DDPMScheduler,
+        conditioned: Conditioned,
+        settings: DistillSettings,
+        guidance_scale: float,
+    ):
         super().__init__()
-        self.trained, self.scheduler, self.settings, self.guidance_scale = unet, scheduler, settings, guidance_scale
+        self.trained = unet
+        self.scheduler = scheduler
+        self.settings = settings
+        self.guidance_scale = guidance_scale
         self.frozen = (conditioned,)  # in a tuple, so that it is no module of this one
-        self.schedule, lcm = NoiseSchedule.of(scheduler), LCMScheduler.from_config(scheduler.config)
+        self.schedule = NoiseSchedule.of(scheduler)
+        lcm = LCMScheduler.from_config(scheduler.config)
         try:
             lcm.set_timesteps(timesteps=settings.timesteps)
         except ValueError as error:
@@ -73,7 +82,8 @@ class DistillObjective(nn.Module):
         self.timesteps = settings.timesteps
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        shape, device = batch["latents"].shape, batch["latents"].device
+        shape = batch["latents"].shape
+        device = batch["latents"].device
         every = torch.ones(len(batch["latents"]), dtype=torch.bool, device=device)
         conditions = self.frozen[0].conditions(batch, every)
         unconditional = self.frozen[0].conditions(batch, ~every)
@@ -97,7 +107,8 @@ class DistillObjective(nn.Module):
     @torch.no_grad()
     def moved(self, drawn: Tensor, conditions: dict[str, Tensor], unconditional: dict[str, Tensor]) -> Tensor:
         """Drawn latents (B, C, h, w), moved to where the guided teacher expects them rather than the critic."""
-        margin, count = self.settings.margin, self.scheduler.config.num_train_timesteps
+        margin = self.settings.margin
+        count = self.scheduler.config.num_train_timesteps
         t = torch.randint(round(margin * count), count - round(margin * count), (len(drawn),), device=drawn.device)
         z = self._noised(drawn, t)
         self._take(CRITIC)
@@ -163,7 +174,8 @@ def conditioned_touches(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
     """The objective that trains a network of touches, and its data."""
-    sensors, with_gels = settings["sensors"], unet.config.in_channels != unet.config.out_channels
+    sensors = settings["sensors"]
+    with_gels = unet.config.in_channels != unet.config.out_channels
     if with_gels and stage.data.drawn is None:
         raise InvalidInputError("`data.sets` have no untouched gels, which `model` learns from; leave them out.")
     for source in stage.sources:
@@ -178,7 +190,8 @@ def conditioned_pictures(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
     """The objective that trains a network of pictures, and its data."""
-    folder, processor = stage.folders["model"], stage.processor
+    folder = stage.folders["model"]
+    processor = stage.processor
     with reading("model", folder):
         normalizer = read_network(StableUnCLIPImageNormalizer, folder / "image_normalizer")
         noising = DDPMScheduler.from_pretrained(folder / "image_noising_scheduler")
@@ -204,7 +217,8 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     with reading("model", folder):
         unet = read_network(UNet2DConditionModel, folder / "unet")
         scheduler = DDPMScheduler.from_pretrained(folder / "scheduler")
-        joint, vae = stage.joint_space("image"), read_autoencoder(folder / "vae")
+        joint = stage.joint_space("image")
+        vae = read_autoencoder(folder / "vae")
     add_layers(unet, recipe.lora, recipe.objective.critic_rank, stage.folders.get("init"))
     conditioned, dataset = conditioned_by(stage, settings, unet, scheduler, joint, vae)
     guidance_scale = settings["default_guidance_scale"]

@@ -54,7 +54,8 @@ class ImageTextObjective(nn.Module):
 
     def __init__(self, model: UniTouchModel, settings: ImageTextSettings):
         super().__init__()
-        self.model, self.settings = model, settings
+        self.model = model
+        self.settings = settings
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / model.config.temperature)))
         self.reader = nn.Linear(model.config.projection_dim, len(SHOWN)) if settings.attributes else None
 
@@ -86,14 +87,18 @@ def recoloured(pictures: Tensor) -> Tensor:
 
 
 def main(stage: Stage, recipe: ImageTextRecipe) -> None:
-    init, objective, config = stage.folders.get("init"), recipe.objective, build("model", UniTouchConfig, recipe.model)
+    init = stage.folders.get("init")
+    objective = recipe.objective
+    config = build("model", UniTouchConfig, recipe.model)
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
-    splits, processor = stage.splits("image", "text"), stage.processor
+    splits = stage.splits("image", "text")
+    processor = stage.processor
     captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
     texts = [caption for one in captions for caption in one]
     if init is not None:
         begun = UniTouchModel.from_pretrained(init, modalities=("image", "text"))
-        begun.config.ood_thresholds, begun.config.sensor_reaches = {}, {}
+        begun.config.ood_thresholds = {}
+        begun.config.sensor_reaches = {}
         # Its touch and audio are bound to what its pictures were.
         model = UniTouchModel(begun.config, modalities=())  # type: ignore[arg-type]
         for modality in ("image", "text"):

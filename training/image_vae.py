@@ -60,7 +60,10 @@ class AutoencoderObjective(nn.Module):
 
     def __init__(self, vae: Autoencoder, weights: AutoencoderLoss, crop: int | None = None, layers: Any = ()):
         super().__init__()
-        self.trained, self.weights, self.crop, self.layers = vae, weights, crop, layers
+        self.trained = vae
+        self.weights = weights
+        self.crop = crop
+        self.layers = layers
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
@@ -84,9 +87,12 @@ class AutoencoderObjective(nn.Module):
 
 def feature_error(layers: Sequence[nn.Module], images: Tensor, wanted: Tensor) -> Tensor:
     """L1 error of a stem's features of images in [-1, 1], relative to their deviation (after Johnson et al., 2016)."""
-    a, b, errors = normalise_pixels(images / 2 + 0.5), normalise_pixels(wanted / 2 + 0.5), list[Tensor]()
+    a = normalise_pixels(images / 2 + 0.5)
+    b = normalise_pixels(wanted / 2 + 0.5)
+    errors = list[Tensor]()
     for layer in layers:
-        a, b = layer.to(a.device)(a), layer(b)
+        a = layer.to(a.device)(a)
+        b = layer(b)
         if isinstance(layer, Residual) or layer is layers[-1]:
             errors.append(((a - b).abs().mean((0, 2, 3)) / b.std((0, 2, 3)).clamp_min(1e-3)).mean())
     return torch.stack(errors).mean()
@@ -120,7 +126,8 @@ def cached_latents(
 
 def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     modality = "touch" if stage.name == "touch_vae" else "image"
-    init, crop = stage.folders.get("init"), recipe.augment.crop
+    init = stage.folders.get("init")
+    crop = recipe.augment.crop
     sizes = {**recipe.model}
     kind = autoencoder_class("model.class", sizes.pop("class", None))
     vae: Any = build("model", kind, sizes) if init is None else read_autoencoder(init).requires_grad_(True)

@@ -26,7 +26,8 @@ def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:
 
 def symmetric_info_nce(a: Tensor, b: Tensor, temperature: float | Tensor) -> Tensor:
     """Eq. 2: L_{A -> B} + L_{B -> A}; of several processes, over the rows of all."""
-    a, b = gathered(a), gathered(b)
+    a = gathered(a)
+    b = gathered(b)
     return info_nce(a, b, temperature) + info_nce(b, a, temperature)
 
 
@@ -45,9 +46,13 @@ def predict(
 
 
 def denoising_loss(
-    unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, step_power: float,
-    extra_channels: Tensor | None = None, **conditions: Tensor,
-) -> Tensor:  # fmt: skip
+    unet: UNet2DConditionModel,
+    scheduler: DDPMScheduler,
+    latents: Tensor,
+    step_power: float,
+    extra_channels: Tensor | None = None,
+    **conditions: Tensor,
+) -> Tensor:
     """Mean squared error of the network's prediction at random steps.
 
     Args:
@@ -58,7 +63,8 @@ def denoising_loss(
             structure is drawn; of uniform steps, 3 % are below a noise level of 0.17.
         extra_channels: What the network is shown beside noisy latents, (B, C', h, w).
     """
-    kind, count = scheduler.config.prediction_type, scheduler.config.num_train_timesteps
+    kind = scheduler.config.prediction_type
+    count = scheduler.config.num_train_timesteps
     if kind not in ("epsilon", "v_prediction"):
         raise InvalidInputError(f"`scheduler` predicts {kind!r}; it has to be 'epsilon' or 'v_prediction'.")
     steps = (torch.rand(len(latents), device=latents.device) ** step_power * count).long()

@@ -92,7 +92,10 @@ class Stage:
         on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
-        self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
+        self.name = name
+        self.output = output or Path("runs") / name
+        self.cache = cache
+        self.resume = resume
         before = read_progress(self.output) if resume else {}
         if (found := checkpoints_in(self.output)) and not resume:
             raise InvalidInputError(
@@ -104,7 +107,8 @@ class Stage:
         changes = overrides or ()
         self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
         self.recipe: Any = read(kind, self.given)
-        self.trainer, self.data = self.recipe.trainer, self.recipe.data
+        self.trainer = self.recipe.trainer
+        self.data = self.recipe.data
         self.batches: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
         folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
@@ -180,7 +184,8 @@ class Stage:
 
     def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
-        sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
+        sizes = [len(split) for split in splits]
+        near = F.normalize(embeds.float(), dim=1).numpy()
         return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)
 
     def check_drawn(self, *weights: str) -> None:
@@ -205,13 +210,17 @@ class Stage:
     def saving(self, **figures: Any) -> Iterator[Path]:
         """The folder to write the stage's model to; `record.json` beside it has seed, recipe, inputs and times."""
         record: dict[str, Any] = {
-            "stage": self.name, "seed": self.trainer.seed, "seconds": round(self.seconds, 1), "version": __version__,
-            "inputs": self.inputs, "trainer": self.trainer.model_dump(),
+            "stage": self.name,
+            "seed": self.trainer.seed,
+            "seconds": round(self.seconds, 1),
+            "version": __version__,
+            "inputs": self.inputs,
+            "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.given.items() if key != "trainer"},
             "sets": self.sets,
             **({"earlier_sets": self.earlier_sets} if self.earlier_sets else {}),
             **figures,
-        }  # fmt: skip
+        }
         for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
             if (beside / "record.json").is_file():  # beside a run's `model`, or a part of that
                 record["started_from"] = json.loads((beside / "record.json").read_text())

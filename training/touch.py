@@ -76,7 +76,8 @@ class TouchEncoder(nn.Module):
 
     def __init__(self, model: UniTouchModel, weights: LossWeights):
         super().__init__()
-        self.transformer, self.bank = model.touch_model, model.sensor_bank
+        self.transformer = model.touch_model
+        self.bank = model.sensor_bank
         config: Any = model.config.touch_config
         self.grid = config.grid
         self.reader = nn.Linear(config.projection_dim, len(ATTRIBUTES)) if weights.attributes else None
@@ -97,7 +98,8 @@ class TouchEncoder(nn.Module):
 
     def _tokens(self, stemmed: Tensor, prefix: Tensor | None = None) -> Tensor:
         """Tokens of class and patches, (B, 1 + patches, width), of the stem's output."""
-        tokens, patches = self.transformer.tokens(stemmed, prefix), self.grid[0] * self.grid[1]
+        tokens = self.transformer.tokens(stemmed, prefix)
+        patches = self.grid[0] * self.grid[1]
         return torch.cat([tokens[:, :1], tokens[:, -patches:]], dim=1)
 
 
@@ -108,10 +110,12 @@ class TouchObjective(nn.Module):
         super().__init__()
         self.weights = weights or LossWeights()
         self.trained = TouchEncoder(model, self.weights)
-        self.temperature, self.augment = model.config.temperature, augment
+        self.temperature = model.config.temperature
+        self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        trained, weights = self.trained, self.weights
+        trained = self.trained
+        weights = self.weights
         touch, patches = trained(self.augmented(batch["touch"]), batch["sensor"])
         picture = batch["image_embeds"]
         parts = {"image": symmetric_info_nce(touch, picture, self.temperature)}
@@ -198,7 +202,8 @@ def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> G
 @torch.no_grad()
 def fit_distance(model: UniTouchModel, splits: Sequence[Contacts]) -> None:
     """Gives a model the distance of touches, by class where materials are known, and its threshold."""
-    stem, weight = model.touch_model.stem, model.touch_model.projection.weight
+    stem = model.touch_model.stem
+    weight = model.touch_model.projection.weight
 
     def statistics(images: Iterable[np.ndarray]) -> Tensor:
         pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
@@ -211,7 +216,8 @@ def fit_distance(model: UniTouchModel, splits: Sequence[Contacts]) -> None:
     # Data sets number materials in their own ways, so all of theirs are one class.
     known = [one.material if one.attributes is not None else torch.full((len(one),), -1) for one in splits]
     materials = torch.cat([*map(spread, known)])[rows]
-    touches, pictures = statistics(split.touch for split in splits)[rows], statistics(split.image for split in splits)
+    touches = statistics(split.touch for split in splits)[rows]
+    pictures = statistics(split.image for split in splits)
     distance = RelativeDistance(fit_gaussians(touches, materials), fit_gaussians(pictures, torch.zeros(len(pictures))))
     model.out_of_distribution["touch"] = distance
     model.config.ood_thresholds = {"touch": {"foreign": distance(touches).quantile(1.0 - ABSTAINED).item()}}
@@ -233,7 +239,8 @@ def main(stage: Stage, recipe: TouchRecipe) -> None:
     model = stage.joint_space("image")
     splits = stage.splits("image", "touch", "sensor")
     embeds = stage.image_embeddings(model, splits)
-    tokens, names = recipe.sensors.tokens, dict.fromkeys(name for split in splits for name in split.sensors)
+    tokens = recipe.sensors.tokens
+    names = dict.fromkeys(name for split in splits for name in split.sensors)
     model.config.sensors = [] if tokens == 0 else [name for name in names if name is not None]
     model.config.sensor_tokens = tokens or model.config.sensor_tokens
     model.add("touch")

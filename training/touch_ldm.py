@@ -60,23 +60,33 @@ class TouchDiffusionObjective(nn.Module):
     """
 
     def __init__(
-        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, embedding_norm: float,
-        settings: TouchDiffusionSettings, backgrounds: Tensor | None = None,
-    ):  # fmt: skip
+        self,
+        unet: UNet2DConditionModel,
+        scheduler: DDPMScheduler,
+        embedding_norm: float,
+        settings: TouchDiffusionSettings,
+        backgrounds: Tensor | None = None,
+    ):
         super().__init__()
-        self.trained, self.scheduler, self.embedding_norm, self.settings = unet, scheduler, embedding_norm, settings
+        self.trained = unet
+        self.scheduler = scheduler
+        self.embedding_norm = embedding_norm
+        self.settings = settings
         self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        latents, settings = batch["latents"].float(), self.settings
+        latents = batch["latents"].float()
+        settings = self.settings
         kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
         conditions = self.conditions(batch, kept)
         return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
         """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
-        embeds, settings = batch["image_embeds"].float(), self.settings
-        (count, width), device = embeds.shape, embeds.device
+        embeds = batch["image_embeds"].float()
+        settings = self.settings
+        count, width = embeds.shape
+        device = embeds.device
         size = settings.condition_noise * torch.rand(count, 1, device=device)
         size = size * (torch.rand(count, 1, device=device) < settings.noisy_share)
         noisy = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
@@ -101,7 +111,8 @@ def inputs(
     `sensors` are the names of the class labels. With gels, it also returns the latents (M, C, h, w) of all backgrounds.
     """
     splits = stage.splits("image", "touch", "sensor")
-    embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
+    embeds = stage.image_embeddings(joint, splits)
+    size = splits[0].touch.shape[-1]
     latents = cached_latents(stage, vae, f"touch{size}", splits, [split.touch for split in splits])
     sensor = torch.from_numpy(sensor_numbers(splits, sensors, unnamed=len(sensors)))
     if not with_gels:
@@ -121,7 +132,8 @@ def inputs(
 
 
 def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:
-    joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
+    joint = stage.joint_space("image")
+    vae = read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
     with_gels = stage.data.drawn is not None

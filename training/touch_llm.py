@@ -52,8 +52,10 @@ class AnswerObjective(nn.Module):
 
     def __init__(self, language_model: LlamaForCausalLM, bridge: LanguageBridge, noise: float, frozen: bool):
         super().__init__()
-        self.language_model, self.bridge = language_model.requires_grad_(not frozen), bridge
-        self.noise, self.frozen = noise, frozen
+        self.language_model = language_model.requires_grad_(not frozen)
+        self.bridge = bridge
+        self.noise = noise
+        self.frozen = frozen
 
     @property
     def trained(self) -> nn.Module:
@@ -64,7 +66,8 @@ class AnswerObjective(nn.Module):
         chosen = torch.randint(batch["input_ids"].shape[1], (len(rows),))  # one of the pairs (B, V, T) of each contact
         ids, labels = (batch[name][rows, chosen].long() for name in ("input_ids", "labels"))
         longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # what is behind it is padding
-        ids, labels = ids[:, :longest], labels[:, :longest]
+        ids = ids[:, :longest]
+        labels = labels[:, :longest]
         embeds = F.normalize(batch["image_embeds"].float(), dim=1)
         embeds = embeds + self.noise * torch.rand_like(embeds[:, :1]) * F.normalize(torch.randn_like(embeds), dim=1)
         with self.bridge.attach(self.language_model, embeds):
@@ -105,7 +108,8 @@ def main(stage: Stage, recipe: TouchLLMRecipe) -> None:
     if llama is not None:
         with reading("llama", llama):
             model = read_network(LlamaForCausalLM, llama, dtype=torch.float32)
-    joint, splits = stage.joint_space("image"), stage.splits("image", "text")
+    joint = stage.joint_space("image")
+    splits = stage.splits("image", "text")
     if llama is None:
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
         model = LlamaForCausalLM(build("model", LlamaConfig, recipe.model, vocab_size=len(tokenizer), **special))

@@ -93,18 +93,28 @@ class Trainer:
     """
 
     def __init__(
-        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], Sequence[int]],
-        config: TrainerConfig, output: Path, progress: Mapping[str, Any] | None = None,
-    ):  # fmt: skip
-        self.config, self.output, self.progress = config, output, dict(progress or {})
-        self.dataset, self.indices_of = dataset, indices_of
+        self,
+        objective: nn.Module,
+        dataset: ArrayDataset,
+        indices_of: Callable[[int], Sequence[int]],
+        config: TrainerConfig,
+        output: Path,
+        progress: Mapping[str, Any] | None = None,
+    ):
+        self.config = config
+        self.output = output
+        self.progress = dict(progress or {})
+        self.dataset = dataset
+        self.indices_of = indices_of
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
-        self.step, self.seconds = 0, 0.0
+        self.step = 0
+        self.seconds = 0.0
         self.accelerator = Accelerator(
             mixed_precision=precision_here(config.mixed_precision),
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
         )
-        self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes
+        self.main = self.accelerator.is_main_process
+        processes = self.accelerator.num_processes
         if config.batch_size % processes:
             raise InvalidInputError(f"`batch_size` is {config.batch_size}; take a multiple of {processes} processes.")
         self.trained: nn.Module = getattr(objective, "trained", objective)
@@ -136,7 +146,8 @@ class Trainer:
         if self.ema is not None:
             self.ema.to(self.accelerator.device)  # accelerate reads it onto the CPU
             self.ema.decay = self.config.ema_decay
-        self.step, self.seconds = progress["step"], progress["seconds"]
+        self.step = progress["step"]
+        self.seconds = progress["seconds"]
         # Settings are the configuration's: those stored may be why the run has to go on with others.
         self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
         for group, settings in zip(self.optimizer.param_groups, own, strict=True):
@@ -144,7 +155,8 @@ class Trainer:
 
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode."""
-        config, started = self.config, time.monotonic() - self.seconds
+        config = self.config
+        started = time.monotonic() - self.seconds
         self.output.mkdir(parents=True, exist_ok=True)
         if self.main and self.step == 0:  # what an earlier run left
             (self.output / "log.jsonl").unlink(missing_ok=True)
@@ -243,6 +255,7 @@ def _optimizer(module: nn.Module, config: TrainerConfig) -> torch.optim.Optimize
     weights = {id(layer.weight) for layer in module.modules() if isinstance(layer, nn.Linear | _ConvNd)}
     weights |= {id(layer.in_proj_weight) for layer in module.modules() if isinstance(layer, nn.MultiheadAttention)}
     trained = [p for p in module.parameters() if p.requires_grad]
-    decayed, others = [p for p in trained if id(p) in weights], [p for p in trained if id(p) not in weights]
+    decayed = [p for p in trained if id(p) in weights]
+    others = [p for p in trained if id(p) not in weights]
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, config.beta2))

@@ -53,25 +53,40 @@ class UnclipObjective(nn.Module):
     """
 
     def __init__(
-        self, unet: UNet2DConditionModel, scheduler: DDPMScheduler, settings: UnclipSettings,
-        normalizer: StableUnCLIPImageNormalizer, noising: DDPMScheduler, captions: list[str],
-        processor: UniTouchProcessor, text_encoder: nn.Module, level: int | None = None,
-    ):  # fmt: skip
+        self,
+        unet: UNet2DConditionModel,
+        scheduler: DDPMScheduler,
+        settings: UnclipSettings,
+        normalizer: StableUnCLIPImageNormalizer,
+        noising: DDPMScheduler,
+        captions: list[str],
+        processor: UniTouchProcessor,
+        text_encoder: nn.Module,
+        level: int | None = None,
+    ):
         super().__init__()
-        self.trained, self.scheduler, self.settings, self.level = unet, scheduler, settings, level
+        self.trained = unet
+        self.scheduler = scheduler
+        self.settings = settings
+        self.level = level
         self.frozen = (normalizer, text_encoder.eval())  # in a tuple, so that they are no modules of the objective
-        self.noising, self.captions, self.processor = noising, captions, processor
+        self.noising = noising
+        self.captions = captions
+        self.processor = processor
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        latents, settings = batch["latents"].float(), self.settings
+        latents = batch["latents"].float()
+        settings = self.settings
         kept = torch.rand(len(latents), device=latents.device) >= settings.condition_dropout
         conditions = self.conditions(batch, kept)
         return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
         """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
-        embeds, settings = batch["image_embeds"], self.settings
-        count, device = len(embeds), embeds.device
+        embeds = batch["image_embeds"]
+        settings = self.settings
+        count = len(embeds)
+        device = embeds.device
         if self.level is None:  # some are at level 0, where a picture's own embedding is used, the others at any level
             noised = torch.rand(count, device=device) >= settings.clean_share
             level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
@@ -107,7 +122,8 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayDataset, list[str]]:
     """Columns of pictures' latents, embeddings and numbers, and the caption of each picture."""
     splits = stage.splits("image", "text")
-    embeds, captions = stage.image_embeddings(joint, splits), [caption for split in splits for caption in split.text]
+    embeds = stage.image_embeddings(joint, splits)
+    captions = [caption for split in splits for caption in split.text]
     latents = cached_latents(stage, vae, "image", splits, [split.image for split in splits])
     return ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))), captions
 
@@ -118,7 +134,8 @@ def main(stage: Stage, recipe: UnclipRecipe) -> None:
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
     dataset, captions = inputs(stage, joint, read_autoencoder(stage.folders["vae"]))
     embeds: Any = dataset.columns["image_embeds"]
-    normalizer, noising = fit_normalizer(embeds), DDPMScheduler(beta_schedule="squaredcos_cap_v2")
+    normalizer = fit_normalizer(embeds)
+    noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     texts = (captions, stage.processor, joint.text_model.text_model)
     objective = UnclipObjective(unet, scheduler, recipe.objective, normalizer, noising, *texts)
     stage.fit(objective, dataset)

@@ -8,6 +8,15 @@ from unitouch_gen.training.data.records import Record
 from unitouch_gen.training.data.sets import RecordSet, open_dataset
 
 __all__ = [
-    "Contacts", "DataConfig", "DrawnConfig", "DrawnContacts", "Record", "RecordSet", "Source", "columns_of",
-    "computed_once", "open_dataset", "sensor_numbers",
-]  # fmt: skip
+    "Contacts",
+    "DataConfig",
+    "DrawnConfig",
+    "DrawnContacts",
+    "Record",
+    "RecordSet",
+    "Source",
+    "columns_of",
+    "computed_once",
+    "open_dataset",
+    "sensor_numbers",
+]

@@ -68,8 +68,12 @@ def has(record: Record, need: str) -> bool:
 
 
 def columns_of(
-    sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str],
-) -> list[Contacts]:  # fmt: skip
+    sources: Sequence[Source],
+    cache: Path,
+    config: DataConfig,
+    processor: UniTouchProcessor,
+    needs: Sequence[str],
+) -> list[Contacts]:
     """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
     `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
@@ -97,7 +101,9 @@ def columns_of(
 
 def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Contacts:
     """Renders a split of the world if the cache does not hold it yet, and opens it."""
-    (material, number, _), size, mel = source.contacts(split), processor.image_size, processor.audio
+    material, number, _ = source.contacts(split)
+    size = processor.image_size
+    mel = processor.audio
     fingerprint = f"{source.fingerprint(split)}-{size}-{hashlib.sha256(str(mel).encode()).hexdigest()[:8]}"
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
     columns: dict[str, tuple[Any, ...]] = {
@@ -112,8 +118,14 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
         for scene, seen in tqdm(source.scenes(split, size), source.name, -(-len(material) // GROUP), mininterval=5):
             first, second = seen["touch"].unbind(dim=1)
             clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0]
-            made = {"image": as_bytes(scene.image), "touch": as_bytes(first), "second": as_bytes(second),
-                    "audio": clips, "attributes": seen["attributes"], "maps": seen["maps"]}  # fmt: skip
+            made = {
+                "image": as_bytes(scene.image),
+                "touch": as_bytes(first),
+                "second": as_bytes(second),
+                "audio": clips,
+                "attributes": seen["attributes"],
+                "maps": seen["maps"],
+            }
             for name, values in made.items():
                 arrays[name][len(text) : len(text) + len(values)] = values
             text += scene.text
@@ -122,10 +134,14 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
     arrays: Any = mapped(folder, len(material), columns, write)
     arrays["attributes"] = torch.from_numpy(np.array(arrays["attributes"]))
     return Contacts(
-        **arrays, sensors=[source.sensor] * len(material), objects=10**6 * material + number,
-        labels={"material": material}, classes={"material": MATERIAL_NAMES},
-        text=json.loads((folder / "text.json").read_text()), fingerprint=fingerprint,
-    )  # fmt: skip
+        **arrays,
+        sensors=[source.sensor] * len(material),
+        objects=10**6 * material + number,
+        labels={"material": material},
+        classes={"material": MATERIAL_NAMES},
+        text=json.loads((folder / "text.json").read_text()),
+        fingerprint=fingerprint,
+    )
 
 
 def relit(cache: Path, source: DrawnContacts, split: str, seen: Contacts) -> np.ndarray:
@@ -147,7 +163,8 @@ def decoded(
 
     Files that cannot be read are refused in a list, and leave nothing in the cache.
     """
-    size, mel = processor.image_size, processor.audio
+    size = processor.image_size
+    mel = processor.audio
     side = touch_size or size
     kinds: dict[str, tuple[Any, ...]] = {
         "image": (np.uint8, 3, size, size),
@@ -182,10 +199,14 @@ def decoded(
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     return Contacts(
-        **columns, sensors=[record.sensor for record in data.records], objects=torch.from_numpy(objects),
-        labels=labels, classes=data.classes, fingerprint=fingerprint,
+        **columns,
+        sensors=[record.sensor for record in data.records],
+        objects=torch.from_numpy(objects),
+        labels=labels,
+        classes=data.classes,
+        fingerprint=fingerprint,
         text=[record.caption or "" for record in data.records] if "text" in needs else (),
-    )  # fmt: skip
+    )
 
 
 def as_bytes(pixels: Tensor) -> np.ndarray:

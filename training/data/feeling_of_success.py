@@ -15,7 +15,8 @@ from unitouch_gen.errors import InvalidInputError, check_file, first_line, neede
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.records import Frame, Record, found
 
-LOOKS_LIKE, CLASSES = ("calandra_corl2017_*.h5",), {"grasp": ("dropped", "lifted")}
+LOOKS_LIKE = ("calandra_corl2017_*.h5",)
+CLASSES = {"grasp": ("dropped", "lifted")}
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -35,7 +36,8 @@ def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
     """What a finger felt; a `KeyError` says what is missing."""
     parts = [f"gelsight{finger}_during", "kinectA_rgb_during", f"gelsight{finger}_before"]
     touch, picture, gel = (Frame(str(file), key=attempt[part].name) for part in parts)
-    item, recording = str(value_of(attempt, "object_name")), f"{file.stem.rpartition('_')[2]}/{name}"
+    item = str(value_of(attempt, "object_name"))
+    recording = f"{file.stem.rpartition('_')[2]}/{name}"
     labels = {"grasp": "lifted" if value_of(attempt, "is_gripping") else "dropped"}
     place = f"{recording}/{finger}"
     return Record(place, touch, picture, gel, sensor="gelsight", object=item, recording=recording, labels=labels)

@@ -15,7 +15,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_text
 from unitouch_gen.training.data.records import Frame, Record, few, found, frame_at
 
-LOOKS_LIKE, CLASSES = ("label.json",), {"material": tuple("0123456")}
+LOOKS_LIKE = ("label.json",)
+CLASSES = {"material": tuple("0123456")}
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -30,8 +31,12 @@ def read(folder: Path) -> Iterator[Record]:
     for item, point, split in points:
         sound = folder / f"audio_examples/{item}/{point}.npy"
         yield Record(
-            f"{item}/{point}", Frame(str(folder / f"touch/{item}/{point}.png")),
+            f"{item}/{point}",
+            Frame(str(folder / f"touch/{item}/{point}.png")),
             frame_at(folder / f"vision/{item}/{point}.png"),
-            sensor="tacto" if int(item) <= 100 else "taxim", object=item, labels={"material": str(labels[item])},
-            sound=str(sound) if sound.is_file() else None, split=split,
-        )  # fmt: skip
+            sensor="tacto" if int(item) <= 100 else "taxim",
+            object=item,
+            labels={"material": str(labels[item])},
+            sound=str(sound) if sound.is_file() else None,
+            split=split,
+        )

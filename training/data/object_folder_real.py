@@ -21,7 +21,8 @@ def read(folder: Path) -> Iterator[Record]:
         material = column_of(file, rows[0], ("material", "materials"))
         materials |= {row[item]: row[material].lower() for row in rows if row[material]}
     for image in found(folder, *LOOKS_LIKE):
-        item, trial = image.parents[4].name, f"{image.parents[4].name}/{image.parents[2].name}"
+        item = image.parents[4].name
+        trial = f"{image.parents[4].name}/{image.parents[2].name}"
         labels = {"material": materials[item]} if item in materials else {}
         touch = Frame(str(image))
         yield Record(f"{trial}/{image.stem}", touch, sensor="gelslim", object=item, recording=trial, labels=labels)

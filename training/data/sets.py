@@ -104,7 +104,8 @@ class RecordSet:
                 f"`split` is {by!r}, but {self} has the {of}s {few(sorted(map(str, groups)))}, and no {name!r}; pass "
                 "another of official, object, recording and none."
             )
-        kept, chosen = {name}, f"{name} of the official split"
+        kept = {name}
+        chosen = f"{name} of the official split"
         if by != "official":
             order = sorted(groups, key=lambda group: sha256(group.encode()).digest())
             tenth = max(round(len(order) / 10), 1)
@@ -114,9 +115,13 @@ class RecordSet:
 
 
 def open_dataset(
-    path: str | Path, kind: str = "auto", *, sensor: str | None = None, materials: Sequence[str] | None = None,
+    path: str | Path,
+    kind: str = "auto",
+    *,
+    sensor: str | None = None,
+    materials: Sequence[str] | None = None,
     sampling_rate: int | None = None,
-) -> RecordSet:  # fmt: skip
+) -> RecordSet:
     """Lists the records of a data set in the layout it was published in, or of a folder of one's own.
 
     No image is read.
@@ -132,7 +137,8 @@ def open_dataset(
         InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
             missing, some of which the message names.
     """
-    kinds, how = layouts(), kind
+    kinds = layouts()
+    how = kind
     check_choice("kind", kind, ("auto", *kinds))
     if sensor is not None:
         check_kind("sensor", sensor, str)

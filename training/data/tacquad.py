@@ -34,10 +34,16 @@ def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
     touches, pictures = ([Frame(str(image)) for image in images_in(item / f"{of}{sensor}")] for of in ("", "img_"))
     if not 0 <= start <= end < len(touches):
         raise InvalidInputError(f"{str(item / sensor)!r} has {len(touches)} images, but contact from {start} to {end}.")
-    recording, gel = f"{item.parent.name}/{item.name}/{sensor}", touches[0] if start > 0 else None
+    recording = f"{item.parent.name}/{item.name}/{sensor}"
+    gel = touches[0] if start > 0 else None
     for number in range(start, end + 1):
         picture = pictures[number * len(pictures) // len(touches)] if pictures else None
         yield Record(
-            f"{recording}/{number}", touches[number], picture, gel,
-            sensor=SENSORS[sensor], object=item.name, recording=recording,
-        )  # fmt: skip
+            f"{recording}/{number}",
+            touches[number],
+            picture,
+            gel,
+            sensor=SENSORS[sensor],
+            object=item.name,
+            recording=recording,
+        )

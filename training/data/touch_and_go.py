@@ -17,9 +17,27 @@ from unitouch_gen.training.data.records import Frame, Record, few, found
 
 LOOKS_LIKE = ("dataset/[0-9]*_[0-9]*",)
 MATERIALS = (
-    "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
-    "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others",
-)  # fmt: skip
+    "concrete",
+    "plastic",
+    "glass",
+    "wood",
+    "metal",
+    "brick",
+    "tile",
+    "leather",
+    "synthetic fabric",
+    "natural fabric",
+    "rubber",
+    "paper",
+    "tree",
+    "grass",
+    "soil",
+    "rock",
+    "gravel",
+    "sand",
+    "plants",
+    "others",
+)
 SOFT = frozenset({7, 8, 9, 11, 13})
 CLASSES = {"material": MATERIALS, "soft": ("hard", "soft"), "rough": ("smooth", "rough")}
 

@@ -15,7 +15,8 @@ from unitouch_gen.training.data.records import Frame, Record, found, frame_at, i
 
 REAL = ("real/*/dataset_*", "*/dataset_*")  # the second where one half of the data set is alone
 SIMULATED = ("sim/*/*/tactile_images", "*/*/tactile_images")
-LOOKS_LIKE, APART = (*REAL, *SIMULATED), "recording"
+LOOKS_LIKE = (*REAL, *SIMULATED)
+APART = "recording"
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -27,10 +28,16 @@ def read(folder: Path) -> Iterator[Record]:
         if not images:
             how = "mkdir frames; ffmpeg -i frames.mp4 -start_number 0 -q:v 2 frames/frame_%07d.jpg"
             raise InvalidInputError(f"{str(place)!r} has no images; where there is a video alone, run: {how}")
-        item, recording = run.parent.name, f"{sensor}/{run.parent.name}/{run.name}"
+        item = run.parent.name
+        recording = f"{sensor}/{run.parent.name}/{run.name}"
         labels = {"material": item.lstrip("0123456789_").replace("_", " ")}
         for image in images:
             yield Record(
-                f"{recording}/{image.name}", Frame(str(image)), frame_at(run / "webcam_frames" / image.name),
-                sensor=sensor, object=item, recording=recording, labels=labels,
-            )  # fmt: skip
+                f"{recording}/{image.name}",
+                Frame(str(image)),
+                frame_at(run / "webcam_frames" / image.name),
+                sensor=sensor,
+                object=item,
+                recording=recording,
+                labels=labels,
+            )
