@@ -18,6 +18,14 @@ AutoModel.register(UniTouchConfig, UniTouchModel, exist_ok=True)
 AutoProcessor.register(UniTouchConfig, UniTouchProcessor, exist_ok=True)
 
 __all__ = [
-    "MODALITIES", "LanguageBridge", "SensorBank", "SensorMatch", "StemmedCLIPVisionModel", "UniTouchConfig",
-    "UniTouchModel", "UniTouchProcessor", "UniTouchViT", "UniTouchViTConfig",
-]  # fmt: skip
+    "MODALITIES",
+    "LanguageBridge",
+    "SensorBank",
+    "SensorMatch",
+    "StemmedCLIPVisionModel",
+    "UniTouchConfig",
+    "UniTouchModel",
+    "UniTouchProcessor",
+    "UniTouchViT",
+    "UniTouchViTConfig",
+]

@@ -47,7 +47,8 @@ class ContactClassifier(ResNetForImageClassification):
             mean, deviation = self.scale_of_attributes(pixel_values.device)
             read = self.reader(F.adaptive_avg_pool2d(seen.last_hidden_state, GRID).flatten(1))
             attributes = read.float() * deviation + mean
-        logits, features = self.classifier(seen.pooler_output), seen.pooler_output.flatten(1)
+        logits = self.classifier(seen.pooler_output)
+        features = seen.pooler_output.flatten(1)
         return ContactClassifierOutput(logits=logits, attributes=attributes, features=features)
 
     @torch.no_grad()

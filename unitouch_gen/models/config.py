@@ -83,8 +83,17 @@ class UniTouchViTConfig(PreTrainedConfig):
     def __post_init__(self, **kwargs: Any) -> None:
         check_spelling(UniTouchViTConfig, kwargs)
         super().__post_init__(**kwargs)
-        for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
-                     "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
+        for name in (
+            "hidden_size",
+            "num_hidden_layers",
+            "num_attention_heads",
+            "num_channels",
+            "patch_size",
+            "patch_stride",
+            "projection_dim",
+            "image_height",
+            "image_width",
+        ):
             check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
         check_integer("patch_channels", self.patch_channels, 0)
         check_integer("texture_width", self.texture_width, 0)
@@ -104,12 +113,36 @@ class UniTouchViTConfig(PreTrainedConfig):
 
 
 # ImageBind's, which the paper builds on.
-VISION = {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16,
-          "patch_size": 14, "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
-TEXT = {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 24, "num_attention_heads": 16,
-        "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
-AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12, "image_height": 128,
-         "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
+VISION = {
+    "hidden_size": 1280,
+    "intermediate_size": 5120,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 16,
+    "patch_size": 14,
+    "projection_dim": 1024,
+    "hidden_act": "gelu",
+    "layer_norm_eps": 1e-6,
+}
+TEXT = {
+    "hidden_size": 1024,
+    "intermediate_size": 4096,
+    "num_hidden_layers": 24,
+    "num_attention_heads": 16,
+    "projection_dim": 1024,
+    "hidden_act": "gelu",
+    "layer_norm_eps": 1e-6,
+}
+AUDIO = {
+    "hidden_size": 768,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 12,
+    "image_height": 128,
+    "image_width": 204,
+    "num_channels": 1,
+    "patch_size": 16,
+    "patch_stride": 10,
+    "stem_norm": True,
+}
 
 
 class UniTouchConfig(PreTrainedConfig):

@@ -144,7 +144,8 @@ def _decoded(subject: str, image: Any) -> np.ndarray:
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
         image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
         with suppress(ImageCms.PyCMSError, OSError):  # as viewers show it where a profile is broken, or of another mode
-            given, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+            given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            srgb = ImageCms.createProfile("sRGB")
             image = ImageCms.profileToProfile(image, given, srgb, outputMode="RGB") if profile else image
         return np.array(image.convert("RGB"))
 
@@ -162,7 +163,8 @@ def _upright(image: Any) -> Any:
 
 def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
     """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
-    low, high = int(values.min()), int(values.max())
+    low = int(values.min())
+    high = int(values.max())
     if low < 0 or high >= 1 << 16:
         raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
     bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
@@ -200,7 +202,8 @@ def _checked(name: str, tensor: Tensor) -> list[Tensor]:
     if tensor.dtype != torch.uint8:
         integers = not (tensor.is_floating_point() or tensor.dtype == torch.bool)
         tensor = tensor.long() if integers else check_finite(name, tensor).float()
-        low, high = tensor.min().item(), tensor.max().item()
+        low = tensor.min().item()
+        high = tensor.max().item()
         if low < 0 or high > (255 if integers else 1):
             found = f"`{name}` holds values from {low:g} to {high:g}"
             raise InvalidInputError(f"{found}; float images run from 0 to 1 and integer images from 0 to 255.")
@@ -226,7 +229,8 @@ def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:
         by_height = rows * width <= columns * height
         target = (height, columns * height // rows) if by_height else (rows * width // columns, width)
         image = F.interpolate(image[None], target, mode="bicubic", antialias=True)[0]
-        top, left = (target[0] - height) // 2, (target[1] - width) // 2
+        top = (target[0] - height) // 2
+        left = (target[1] - width) // 2
         image = image[:, top : top + height, left : left + width]
     return image.float() / 255.0 if image.dtype == torch.uint8 else image.clamp(0.0, 1.0)
 

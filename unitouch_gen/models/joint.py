@@ -39,7 +39,9 @@ MODULES: dict[str, tuple[str, ...]] = {  # sub-modules of each modality; also th
     "touch": ("touch_model", "sensor_bank"),
 }
 
-UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"  # why a model abstains from naming a touch
+UNLIKE = "unlike anything known"
+UNTOUCHED = "nothing is touched"
+"""Why a model abstains from naming a touch."""
 
 _READING = threading.Lock()  # held while an encoder is read: threads that share a model do it once
 
@@ -253,10 +255,16 @@ class UniTouchModel(PreTrainedModel):
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
-        cls, pretrained_model_name_or_path: str | os.PathLike, *, modalities: Iterable[str] = (),
-        dtype: torch.dtype | None = None, subfolder: str = "", variant: str | None = None,
-        config: UniTouchConfig | None = None, **kwargs: Any,
-    ) -> Self:  # fmt: skip
+        cls,
+        pretrained_model_name_or_path: str | os.PathLike,
+        *,
+        modalities: Iterable[str] = (),
+        dtype: torch.dtype | None = None,
+        subfolder: str = "",
+        variant: str | None = None,
+        config: UniTouchConfig | None = None,
+        **kwargs: Any,
+    ) -> Self:
         """Reads a model from a folder of safetensors, or from a repository id.
 
         Args:
@@ -279,7 +287,8 @@ class UniTouchModel(PreTrainedModel):
             if not (source / "config.json").is_file():
                 raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
-            model.source, model._stored = source, stored_tensors(source, variant)
+            model.source = source
+            model._stored = stored_tensors(source, variant)
             if "foreign" in model.config.ood_thresholds.get("touch", {}):
                 model.out_of_distribution["touch"] = RelativeDistance.from_tensors(model._stored)
             model.to(dtype).eval()  # type: ignore[arg-type]
@@ -297,8 +306,10 @@ class UniTouchModel(PreTrainedModel):
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:
     """Tensors of a saved model by name, memory-mapped: they are read when used."""
-    part, found = f".{variant}" if variant else "", dict[str, Tensor]()
-    index, files = folder / f"model.safetensors.index{part}.json", {f"model{part}.safetensors"}
+    part = f".{variant}" if variant else ""
+    found = dict[str, Tensor]()
+    index = folder / f"model.safetensors.index{part}.json"
+    files = {f"model{part}.safetensors"}
     if index.is_file():
         files = {Path(file).name for file in read_settings("source", index)["weight_map"].values()}  # never outside
     for file in sorted(folder / name for name in files):
@@ -328,7 +339,8 @@ class Gaussians(nn.Module):
         self.register_buffer("whitening", whitening)
 
     def forward(self, features: Tensor) -> Tensor:
-        means, whitening = self.means.float(), self.whitening.float()
+        means = self.means.float()
+        whitening = self.whitening.float()
         centre = means.mean(dim=0)  # distances keep their digits near 0
         apart = torch.cdist((features.float() - centre) @ whitening, (means - centre) @ whitening)
         return apart.amin(dim=1).square()

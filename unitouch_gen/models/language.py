@@ -56,9 +56,16 @@ class LanguageBridge(ModelMixin, ConfigMixin):
 
     @register_to_config
     def __init__(
-        self, embedding_dim: int, hidden_size: int, num_layers: int, num_heads: int, num_blocks: int = 3,
-        intermediate_size: int | None = None, legacy: bool = False, value_rank: int = 0,
-    ):  # fmt: skip
+        self,
+        embedding_dim: int,
+        hidden_size: int,
+        num_layers: int,
+        num_heads: int,
+        num_blocks: int = 3,
+        intermediate_size: int | None = None,
+        legacy: bool = False,
+        value_rank: int = 0,
+    ):
         super().__init__()
         hidden = intermediate_size or 4 * hidden_size
         self.projection = nn.Linear(embedding_dim, hidden_size)
@@ -72,11 +79,15 @@ class LanguageBridge(ModelMixin, ConfigMixin):
 
     @classmethod
     def for_model(
-        cls, language_model: PreTrainedModel, embedding_dim: int, num_blocks: int = 3,
+        cls,
+        language_model: PreTrainedModel,
+        embedding_dim: int,
+        num_blocks: int = 3,
         intermediate_size: int | None = None,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """A new bridge into a language model."""
-        config, layers = language_model.config.get_text_config(), len(attentions_of(language_model))
+        config = language_model.config.get_text_config()
+        layers = len(attentions_of(language_model))
         sizes = config.hidden_size, layers, config.num_attention_heads
         return cls(embedding_dim, *sizes, num_blocks, intermediate_size)
 
@@ -109,7 +120,8 @@ class LanguageBridge(ModelMixin, ConfigMixin):
             NonFiniteError: If an adapter token is not finite.
         """
         attentions = self.check_fits(language_model)
-        adapters, attached = self(embeds), ExitStack()
+        adapters = self(embeds)
+        attached = ExitStack()
         if not bool(adapters.isfinite().all()):
             raise NonFiniteError("The adapter of an embedding is not finite; run the bridge in float32 or bfloat16.")
         for layer, attention in enumerate(attentions):
@@ -122,7 +134,10 @@ class AdapterHook:
     """Adds the gated values of an adapter token (B, C) to the input of a layer's `o_proj`, (B n, T, H d)."""
 
     def __init__(self, bridge: LanguageBridge, attention: Any, layer: int, adapter: Tensor):
-        self.bridge, self.attention, self.layer, self.adapter = bridge, attention, layer, adapter
+        self.bridge = bridge
+        self.attention = attention
+        self.layer = layer
+        self.adapter = adapter
         self.value: Tensor | None = None  # known from the first forward on, when offloaded weights are in their place
 
     def __call__(self, o_proj: nn.Module, inputs: tuple[Tensor]) -> Tensor:
@@ -135,14 +150,17 @@ class AdapterHook:
 
     def gated_value(self, states: Tensor) -> Tensor:
         """tanh(g_h) (W_v a)_h of all heads, (B, 1, H d)."""
-        bridge, attention, adapter = self.bridge, self.attention, self.adapter.to(states)
+        bridge = self.bridge
+        attention = self.attention
+        adapter = self.adapter.to(states)
         gates = bridge.gates[self.layer].tanh().to(states)
         size = states.shape[-1] // len(gates)  # d, of a head
         value_heads = attention.config.num_key_value_heads
         project = attention.v_proj if hasattr(attention, "v_proj") else attention.qkv_proj  # v is its last part
         value = project(adapter)[:, -value_heads * size :]
         if bridge.value_down is not None and bridge.value_up is not None:
-            down, up = bridge.value_down[self.layer].to(states), bridge.value_up[self.layer].to(states)
+            down = bridge.value_down[self.layer].to(states)
+            up = bridge.value_up[self.layer].to(states)
             value = value - adapter @ down.T @ up.T
         value = value.unflatten(1, (value_heads, size)).repeat_interleave(len(gates) // value_heads, dim=1)
         return (gates[:, None] * value).flatten(1).to(states)[:, None]

@@ -62,9 +62,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
     model_input_names = ["pixel_values", "touch_values", "input_values", "input_ids", "attention_mask"]
 
     def __init__(
-        self, image_size: int = 224, audio: LogMel | dict[str, Any] | None = None,
-        tokenizer: CLIPTokenizer | None = None, **kwargs: Any,
-    ):  # fmt: skip
+        self,
+        image_size: int = 224,
+        audio: LogMel | dict[str, Any] | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        **kwargs: Any,
+    ):
         kwargs.pop("auto_map", None)  # the folder's, not the processor's
         super().__init__(**kwargs)
         self.image_size = check_integer("image_size", image_size, 8, 8000)

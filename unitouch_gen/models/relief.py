@@ -82,7 +82,9 @@ def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
     down = (detail[..., 2:, 1:-1] - detail[..., :-2, 1:-1]).flatten(2) / 2.0
     both = torch.cat([along, down], dim=1)
     products = both @ both.mT / both.shape[-1]
-    aa, ab, bb = products[:, :channels, :channels], products[:, :channels, channels:], products[:, channels:, channels:]
+    aa = products[:, :channels, :channels]
+    ab = products[:, :channels, channels:]
+    bb = products[:, channels:, channels:]
     noise = 2e-3 * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + 5e-6  # of the gradients: a share, and the least
     eye = noise[:, None, None] * torch.eye(channels).to(detail)
     whiten = torch.linalg.inv(torch.linalg.cholesky(aa + bb + eye))  # of the energy of one sum
@@ -111,7 +113,8 @@ def _heights(slopes: Tensor) -> Tensor:
     height, width = slopes.shape[-2:]
     cos_y, sin_y, waves_y = _waves(height, slopes)
     cos_x, sin_x, waves_x = _waves(width, slopes)
-    kx, ky = waves_x[None, :], waves_y[:, None]
+    kx = waves_x[None, :]
+    ky = waves_y[:, None]
     square = (kx**2 + ky**2).clamp_min(1e-6)
     found = -(cos_y @ slopes[:, 0] @ sin_x.T * kx + sin_y @ slopes[:, 1] @ cos_x.T * ky) / square
     coarsest = (3.0 * math.pi) ** 2 * (1.0 / width**2 + 1.0 / height**2) / 2.0

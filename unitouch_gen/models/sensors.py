@@ -48,11 +48,17 @@ class SensorBank(nn.Module):
     known: Tensor
 
     def __init__(
-        self, names: Sequence[str], tokens: int, width: int, prototype_size: int,
+        self,
+        names: Sequence[str],
+        tokens: int,
+        width: int,
+        prototype_size: int,
         reaches: Mapping[str, float] | None = None,
-    ):  # fmt: skip
+    ):
         super().__init__()
-        self.names, self.prototype_size, self.reaches = tuple(names), prototype_size, dict(reaches or {})
+        self.names = tuple(names)
+        self.prototype_size = prototype_size
+        self.reaches = dict(reaches or {})
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
         self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))  # which have a prototype

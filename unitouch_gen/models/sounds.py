@@ -67,12 +67,14 @@ def _load(name: str, sound: Any) -> Sound:
     full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
     if full_scale > 1 << 15 and (samples & 255).any():  # none of fewer bits that stand at the top
         peak = max(int(samples.max()), -int(samples.min()))
-        usual, full_scale = full_scale, 2.0 ** (15 if peak <= 1 << 15 else 23 if peak <= 1 << 23 else 31)
+        usual = full_scale
+        full_scale = 2.0 ** (15 if peak <= 1 << 15 else 23 if peak <= 1 << 23 else 31)
         if full_scale < usual:
             warnings.warn(f"`{name}` holds up to {peak}; full scale is taken to be {full_scale:.0f}.", stacklevel=2)
     with np.errstate(all="ignore"):
         channels = np.atleast_2d(samples)
-        mean, power = channels.mean(axis=0), channels.var(axis=1)
+        mean = channels.mean(axis=0)
+        power = channels.var(axis=1)
         cancelled = mean.var() < power.mean() / (2 * len(channels))  # as of a microphone that is wired upside down
         samples = ((channels[power.argmax()] if cancelled else mean) / full_scale).astype(np.float32)
     if not np.isfinite(samples).all():
@@ -121,11 +123,20 @@ class LogMel:
     std: float = 9.138
 
     def __post_init__(self) -> None:
-        for name, low, high in (("sampling_rate", *RATES), ("clips", 1, 1000), ("mel_bins", 1, 1024),
-                                ("frames", 1, 100_000)):  # fmt: skip
+        for name, low, high in (
+            ("sampling_rate", *RATES),
+            ("clips", 1, 1000),
+            ("mel_bins", 1, 1024),
+            ("frames", 1, 100_000),
+        ):
             check_integer(name, getattr(self, name), low, high)
-        for name, least in (("frame_length", 2 / self.sampling_rate), ("frame_shift", 1 / self.sampling_rate),
-                            ("clip_seconds", self.frame_length), ("mean", -100.0), ("std", 1e-4)):  # fmt: skip
+        for name, least in (
+            ("frame_length", 2 / self.sampling_rate),
+            ("frame_shift", 1 / self.sampling_rate),
+            ("clip_seconds", self.frame_length),
+            ("mean", -100.0),
+            ("std", 1e-4),
+        ):
             check_number(name, getattr(self, name), least, 3600.0)
 
     def __call__(self, sound: Sound) -> Tensor:
@@ -136,14 +147,24 @@ class LogMel:
         return torch.stack([self._clip(samples[start : start + length]) for start in starts])
 
     def _clip(self, samples: np.ndarray) -> Tensor:
-        length, shift = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
+        length = round(self.frame_length * self.sampling_rate)
+        shift = round(self.frame_shift * self.sampling_rate)
         samples = np.pad(samples - samples.mean(), (0, max(length - len(samples), 0)))
         points = 1 << (length - 1).bit_length()  # of the transform: the power of two that a frame fits in
         picture = spectrogram(
-            samples, np.hanning(length), length, shift, points, power=2.0, center=False, preemphasis=0.97,
-            remove_dc_offset=True, mel_filters=_filters(points, self.mel_bins, self.sampling_rate),
-            mel_floor=2.0**-23, log_mel="log",
-        )[:, : self.frames]  # fmt: skip
+            samples,
+            np.hanning(length),
+            length,
+            shift,
+            points,
+            power=2.0,
+            center=False,
+            preemphasis=0.97,
+            remove_dc_offset=True,
+            mel_filters=_filters(points, self.mel_bins, self.sampling_rate),
+            mel_floor=2.0**-23,
+            log_mel="log",
+        )[:, : self.frames]
         picture = np.pad(picture, ((0, 0), (0, self.frames - picture.shape[1])))
         return torch.from_numpy((picture - self.mean) / self.std).float()[None]
 

@@ -26,7 +26,8 @@ class StreamNorm(nn.LayerNorm):
     """A norm of the residual stream: computed in the stream's dtype, returned in the weights'."""
 
     def forward(self, x: Tensor) -> Tensor:
-        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
+        weight = self.weight.to(x.dtype)
+        bias = self.bias.to(x.dtype)
         return F.layer_norm(x, self.normalized_shape, weight, bias, self.eps).to(self.weight.dtype)
 
 
@@ -35,9 +36,11 @@ class Block(nn.Module):
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
-        width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
+        width = config.hidden_size
+        hidden = int(config.mlp_ratio * config.hidden_size)
         self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
-        heads, bias = config.num_attention_heads, config.add_bias_kv
+        heads = config.num_attention_heads
+        bias = config.add_bias_kv
         self.attention = nn.MultiheadAttention(width, heads, add_bias_kv=bias, batch_first=True)
         self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
@@ -84,7 +87,8 @@ def residual_stem(config: Any, side: int) -> list[nn.Module]:
     Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as
     drawn ones do are then hardly told apart. `side` is the images' shorter one.
     """
-    of_touch, channels = getattr(config, "stem", "residual") == "relief", config.num_channels
+    of_touch = getattr(config, "stem", "residual") == "relief"
+    channels = config.num_channels
     layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
     channels = channels + RELIEF_CHANNELS if of_touch else 2 * channels
     halvings = config.patch_size.bit_length() - 1
