@@ -10,7 +10,24 @@ from unitouch_gen.world.sensors import SENSORS, Sensor, draw_sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 
 __all__ = [
-    "ATTRIBUTES", "CELLS", "DURATION", "FIRST_OBJECT", "MAPS", "MATERIALS", "MATERIAL_NAMES", "MODALITIES",
-    "SAMPLE_RATE", "SENSORS", "Material", "Pressed", "Scene", "Sensor", "World", "contact_attributes",
-    "contact_maps", "draw_sensor", "press", "untouched_gel",
-]  # fmt: skip
+    "ATTRIBUTES",
+    "CELLS",
+    "DURATION",
+    "FIRST_OBJECT",
+    "MAPS",
+    "MATERIALS",
+    "MATERIAL_NAMES",
+    "MODALITIES",
+    "SAMPLE_RATE",
+    "SENSORS",
+    "Material",
+    "Pressed",
+    "Scene",
+    "Sensor",
+    "World",
+    "contact_attributes",
+    "contact_maps",
+    "draw_sensor",
+    "press",
+    "untouched_gel",
+]

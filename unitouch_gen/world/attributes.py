@@ -9,9 +9,20 @@ from torch import Tensor
 from unitouch_gen.world.grids import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
-    "cover", "depth", "load", "slope", "steepness", "fine relief", "coarse relief", "grain x", "grain y", "place x",
-    "place y", "extent", "compliance",
-)  # fmt: skip
+    "cover",
+    "depth",
+    "load",
+    "slope",
+    "steepness",
+    "fine relief",
+    "coarse relief",
+    "grain x",
+    "grain y",
+    "place x",
+    "place y",
+    "extent",
+    "compliance",
+)
 """In this order: share of the view in contact; logarithms of the greatest and mean indentation (mm), of the RMS slope
 over the view and where there is contact, of the RMS relief (mm) finer than 3 % and from 3 to 12 % of the view; the
 grain's direction as cos and sin of twice its angle, weighted by how clear it is; where the contact's middle lies and
@@ -43,11 +54,20 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
     y = (touched * axis[:, None]).sum(dim=(-2, -1)) / area
     away = (axis - x[:, None, None]) ** 2 + (axis[:, None] - y[:, None, None]) ** 2
     columns = (
-        cover, torch.log(indentation.amax(dim=(-2, -1)) + 0.02), torch.log(indentation.mean(dim=(-2, -1)) + 0.003),
-        torch.log(power.sqrt() + 0.01), 0.5 * torch.log(power / cover.clamp_min(1e-3) + 1e-3), torch.log(fine + 1e-3),
-        torch.log(coarse + 2e-3), clear * (xx - yy), clear * 2 * xy, x, y,
-        ((touched * away).sum(dim=(-2, -1)) / area).sqrt(), compliance,
-    )  # fmt: skip
+        cover,
+        torch.log(indentation.amax(dim=(-2, -1)) + 0.02),
+        torch.log(indentation.mean(dim=(-2, -1)) + 0.003),
+        torch.log(power.sqrt() + 0.01),
+        0.5 * torch.log(power / cover.clamp_min(1e-3) + 1e-3),
+        torch.log(fine + 1e-3),
+        torch.log(coarse + 2e-3),
+        clear * (xx - yy),
+        clear * 2 * xy,
+        x,
+        y,
+        ((touched * away).sum(dim=(-2, -1)) / area).sqrt(),
+        compliance,
+    )
     return torch.stack(columns, dim=1)
 
 

@@ -35,10 +35,13 @@ def _photograph(rng: np.random.Generator, picture: Tensor, share: float) -> Tens
         return picture
     size = picture.shape[-1]
     axis = pixel_axis(size, 2.0)
-    x, y = axis[None, :], axis[:, None]
+    x = axis[None, :]
+    y = axis[:, None]
 
     # 1. Light: a gradient, a vignette, and the soft edge of a shadow, in which daylight is bluer.
-    turn, slope, vignette = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.3), rng.uniform(0.0, 0.2)
+    turn = rng.uniform(-math.pi, math.pi)
+    slope = rng.uniform(0.0, 0.3)
+    vignette = rng.uniform(0.0, 0.2)
     light = 1.0 + slope * (math.cos(turn) * x + math.sin(turn) * y) - vignette * 0.5 * (x**2 + y**2)
     light = light.expand(3, -1, -1)
     turn, place, width, dark = (
@@ -49,7 +52,9 @@ def _photograph(rng: np.random.Generator, picture: Tensor, share: float) -> Tens
         light = light * (1.0 - dark * torch.tensor([1.0, 0.95, 0.85])[:, None, None] * shadow)
 
     # 2. Colours: temperature and tint of the white balance, exposure, saturation and tone.
-    warmth, green, exposure = rng.normal(0.0, 0.07), rng.normal(0.0, 0.03), rng.normal(0.0, 0.2)
+    warmth = rng.normal(0.0, 0.07)
+    green = rng.normal(0.0, 0.03)
+    exposure = rng.normal(0.0, 0.2)
     gains = torch.tensor([exposure + warmth, exposure + green, exposure - warmth]).exp()
     linear = picture**2.2 * light * gains[:, None, None].float()
     seen = linear.clamp(1e-6, 1.0) ** (rng.uniform(0.85, 1.2) / 2.2)

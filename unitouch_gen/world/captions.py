@@ -16,18 +16,33 @@ BEGINNINGS: tuple[str, ...] = ("", "", "a photo of ", "a picture of ", "a close 
 NOUNS: tuple[str, ...] = ("surface", "material", "thing", "object", "piece")
 
 COLOURS: dict[str, tuple[float, float, float]] = {
-    "black": (0.08, 0.08, 0.08), "dark grey": (0.25, 0.25, 0.25), "grey": (0.5, 0.5, 0.5), "white": (0.9, 0.9, 0.9),
-    "red": (0.75, 0.18, 0.15), "orange": (0.8, 0.5, 0.2), "yellow": (0.9, 0.8, 0.2), "green": (0.3, 0.5, 0.15),
-    "teal": (0.25, 0.55, 0.55), "blue": (0.18, 0.3, 0.75), "pink": (0.75, 0.25, 0.45), "brown": (0.4, 0.25, 0.14),
-    "beige": (0.78, 0.68, 0.5), "pale blue": (0.62, 0.74, 0.86),
-}  # fmt: skip
+    "black": (0.08, 0.08, 0.08),
+    "dark grey": (0.25, 0.25, 0.25),
+    "grey": (0.5, 0.5, 0.5),
+    "white": (0.9, 0.9, 0.9),
+    "red": (0.75, 0.18, 0.15),
+    "orange": (0.8, 0.5, 0.2),
+    "yellow": (0.9, 0.8, 0.2),
+    "green": (0.3, 0.5, 0.15),
+    "teal": (0.25, 0.55, 0.55),
+    "blue": (0.18, 0.3, 0.75),
+    "pink": (0.75, 0.25, 0.45),
+    "brown": (0.4, 0.25, 0.14),
+    "beige": (0.78, 0.68, 0.5),
+    "pale blue": (0.62, 0.74, 0.86),
+}
 
 SHAPE_WORDS: dict[str, tuple[str, ...]] = {
-    "flat": ("a flat face", "flat all over"), "ball": ("round like a ball", "a small ball"),
-    "rod": ("a rod", "round like a pen"), "blob": ("shaped like a fruit", "a round lump"),
-    "edge": ("a straight edge", "ending in an edge"), "corner": ("a corner", "ending in a corner"),
-    "box": ("a small block", "with flat sides"), "coin": ("a disc", "like a coin"), "ring": ("a ring", "a round rim"),
-}  # fmt: skip
+    "flat": ("a flat face", "flat all over"),
+    "ball": ("round like a ball", "a small ball"),
+    "rod": ("a rod", "round like a pen"),
+    "blob": ("shaped like a fruit", "a round lump"),
+    "edge": ("a straight edge", "ending in an edge"),
+    "corner": ("a corner", "ending in a corner"),
+    "box": ("a small block", "with flat sides"),
+    "coin": ("a disc", "like a coin"),
+    "ring": ("a ring", "a round rim"),
+}
 
 ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.05, "slightly rough": 0.15, "rough": 0.35, "bumpy": math.inf}
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
@@ -48,7 +63,8 @@ def sentence(draws: Draws, row: int, variant: int) -> str:
     """Roughness, hardness and colour, some of them left out, before the material or a noun; then grain and shape."""
     spec = MATERIALS[int(draws.material[row])]
     a, b = draws.wording[row].double().tolist()
-    a, b = a + 0.618033989 * variant, b + 0.569840291 * variant
+    a = a + 0.618033989 * variant
+    b = b + 0.569840291 * variant
     chances = iter([(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)])
 
     def one(choices: tuple[str, ...] | list[str]) -> str:

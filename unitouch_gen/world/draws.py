@@ -26,9 +26,16 @@ SCAN_STREAM, CAMERA_STREAM, RECORDING_STREAM = range(7, 10)
 MODES = 14  # partials of each object's sound
 
 SHAPES: dict[str, float] = {
-    "flat": 0.80, "ball": 0.03, "rod": 0.04, "blob": 0.04, "edge": 0.03, "corner": 0.02, "box": 0.02, "coin": 0.01,
+    "flat": 0.80,
+    "ball": 0.03,
+    "rod": 0.04,
+    "blob": 0.04,
+    "edge": 0.03,
+    "corner": 0.02,
+    "box": 0.02,
+    "coin": 0.01,
     "ring": 0.01,
-}  # fmt: skip
+}
 """Shapes that contacts are at, and how often: four of five are at a face that fills the gel, as real touches are."""
 
 FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600, "beyond": 800}
@@ -89,7 +96,8 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
     colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, 0.1, 3))  # dark things stay dark
     of_object.uniform(size=7 if beyond else 5)
-    tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
+    tilt = of_contact.uniform(0.35, 1.2)
+    turn = of_contact.uniform(-np.pi, np.pi)
     row: dict[str, Any] = {
         "scale": log_uniform(of_object, 0.7, 1.45, beyond),  # factor on lengths of the material's relief
         "amplitude": log_uniform(of_object, 0.85, 1.8, beyond),  # and on its heights
@@ -129,7 +137,8 @@ def _draw_sound(seed: int, name: tuple[int, int, int], compliance: float, radius
     shape are as one over their size; small bodies sound higher, and soft ones duller and shorter.
     """
     spec = MATERIALS[name[0]]
-    of_object, of_contact = generator(seed, ROOM_STREAM, *name[:2]), generator(seed, ROOM_STREAM, *name)
+    of_object = generator(seed, ROOM_STREAM, *name[:2])
+    of_contact = generator(seed, ROOM_STREAM, *name)
     softer = compliance - spec.compliance
     pitch = log_uniform(of_object, 0.6, 1.6)
     size = 50.0 / pitch

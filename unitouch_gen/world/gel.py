@@ -90,7 +90,9 @@ def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
     """
     size = load.shape[-2:]
     rho = 0.4 * spread.max().sqrt()  # near the fastest on balls at all resolutions
-    displacement, multiplier, denominator = load, torch.zeros_like(load), spread + rho
+    displacement = load
+    multiplier = torch.zeros_like(load)
+    denominator = spread + rho
     for _ in range(steps):
         spectrum = torch.fft.rfft2((displacement - multiplier).mul_(rho)).div_(denominator)
         multiplier += torch.fft.irfft2(spectrum, s=size)
@@ -136,7 +138,8 @@ def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -
     Each light adds what Lambert's cosine law changes where a facet turns from the gel's plane.
     """
     axis = pixel_axis(slope_x.shape[-1], 2.0)
-    x, y = axis[None, :], axis[:, None]
+    x = axis[None, :]
+    y = axis[:, None]
     images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
     gradients = sensor.gradients or ((0.0, 0.0),) * len(sensor.azimuths)
@@ -162,9 +165,11 @@ def gel_background(sensor: Sensor, resolution: int) -> Tensor:
 
 def marker_mask(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -> Tensor:
     """Transmission (N, 1, S, S) of printed dots that the gel's displacement drags along."""
-    axis, pitch = pixel_axis(slope_x.shape[-1], sensor.field_of_view), sensor.marker_pitch
+    axis = pixel_axis(slope_x.shape[-1], sensor.field_of_view)
+    pitch = sensor.marker_pitch
     shift = 0.8 * depth  # how far a marker moves sideways, mm, at a slope of one
-    x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
+    x = axis[None, None, :] + shift * slope_x
+    y = axis[None, :, None] + shift * slope_y
     # Offset from the nearest dot; 512 more periods keep `frac`'s argument positive.
     nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
     nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch

@@ -33,7 +33,8 @@ def convolved(field: Tensor, weights: Tensor) -> Tensor:
 
     By two matrix products: on a CPU a fraction of what a convolution of one channel takes.
     """
-    size, reach = field.shape[-1], len(weights) // 2
+    size = field.shape[-1]
+    reach = len(weights) // 2
     banded = torch.zeros(size + 2 * reach, size)
     for offset, weight in enumerate(weights.tolist()):
         banded.diagonal(-offset).fill_(weight)

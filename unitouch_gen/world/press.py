@@ -30,7 +30,8 @@ from unitouch_gen.world.gel import gel_displacement, gel_image, gel_square, in_v
 from unitouch_gen.world.grids import pixel_axis
 from unitouch_gen.world.sensors import SENSORS, Sensor
 
-FEWEST, MOST = 8, 8192  # pixels along a side of a height map
+FEWEST = 8  # pixels along a side of a height map
+MOST = 8192
 FLATTEST = 1e-6  # mm; less from the lowest to the highest point is no relief
 DWELL = 1.0  # s between contact and exposure: gels have settled
 
@@ -134,7 +135,8 @@ def _place(place: Any, mm: float, height: Tensor) -> tuple[float, float]:
         raise InvalidInputError(f"`at` holds {describe(place)}; {wanted}.")
     rows, columns = height.shape
     x, y = (check_number("at", value) for value in place)
-    half_width, half_height = 0.5 * mm, 0.5 * mm * rows / columns
+    half_width = 0.5 * mm
+    half_height = 0.5 * mm * rows / columns
     if abs(x) > half_width or abs(y) > half_height:
         most = f"{half_width:g} mm to a side and {half_height:g} mm up and down"
         raise InvalidInputError(f"`at` is ({x:g}, {y:g}), outside the map, which reaches {most} from its centre.")
@@ -149,16 +151,20 @@ def under_gel(height: Tensor, mm: float, place: tuple[float, float], *, extent: 
     rows, columns = height.shape
     pixel = mm / columns  # side of a pixel of the map, mm
     axis = pixel_axis(pixels, extent)
-    x, y = (0.5 * columns + (axis + place[0]) / pixel), (0.5 * rows + (axis + place[1]) / pixel)  # in pixels
+    x = 0.5 * columns + (axis + place[0]) / pixel  # in pixels
+    y = 0.5 * rows + (axis + place[1]) / pixel
     low = [max(math.floor(float(one.min())) - 4, 0) for one in (x, y)]
     high = [min(math.ceil(float(one.max())) + 4, most) for one, most in ((x, columns), (y, rows))]
     crop = height[low[1] : high[1], low[0] : high[0]]
-    x, y = x - low[0], y - low[1]
+    x = x - low[0]
+    y = y - low[1]
     step = math.floor(extent / pixels / pixel)
     if step > 1:
         crop = F.avg_pool2d(crop[None, None], step, ceil_mode=True, count_include_pad=False)[0, 0]
-        x, y = x / step, y / step
-    across, down = 2.0 * x / crop.shape[1] - 1.0, 2.0 * y / crop.shape[0] - 1.0
+        x = x / step
+        y = y / step
+    across = 2.0 * x / crop.shape[1] - 1.0
+    down = 2.0 * y / crop.shape[0] - 1.0
     grid = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)[None]
     mode = "bicubic" if pixel > extent / pixels else "bilinear"  # between far pixels, slopes have to be smooth
     return F.grid_sample(crop[None, None], grid, mode=mode, padding_mode="border", align_corners=False)[0, 0]
@@ -264,7 +270,8 @@ def _checked(name: str, values: np.ndarray, relief_mm: float) -> Tensor:
     if bad := int((~np.isfinite(heights)).sum()):
         raise InvalidInputError(f"`{name}` holds {bad} of {heights.size} values that are NaN or infinite; fill them.")
     heights = relief_mm * heights
-    low, high = heights.min(), heights.max()
+    low = heights.min()
+    high = heights.max()
     if not FLATTEST < high - low < 1e5:
         what = "is flat" if high - low <= FLATTEST else f"reaches over {high - low:g} mm"
         raise InvalidInputError(f"`{name}` {what}; pass a relief in mm, of floats, or integers with `relief_mm`.")

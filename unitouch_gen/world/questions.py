@@ -26,20 +26,34 @@ class Topic:
 TOPICS: dict[str, Topic] = {
     "caption": Topic(("Describe it.", "What is seen and felt?", "What can you say of this touch?")),
     "material": Topic(("What is it?", "What is it made of?", "Which material is this?"), "material"),
-    "feel": Topic(("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
-                  "hard or soft",
-                  {word: ("soft", "hard")[word in ("hard", "firm")] for word in captions.HARDNESS_WORDS}, True),
-    "place": Topic(("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
-                   "contact place", {word: word for word in ("all over", "centre", "left", "right", "above", "below")}),
-    "grain": Topic(("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
-                   "grain", {word: word for word in captions.DIRECTION_WORDS}),
-    "grasp": Topic(("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
-                   "grasp", {"hold": "hold", "slip": "slip"}, True),
-}  # fmt: skip
+    "feel": Topic(
+        ("How does it feel?", "What does the surface feel like?", "How rough and how hard is it?"),
+        "hard or soft",
+        {word: ("soft", "hard")[word in ("hard", "firm")] for word in captions.HARDNESS_WORDS},
+        True,
+    ),
+    "place": Topic(
+        ("Where is the contact?", "Where does it touch the gel?", "Which part of the gel is touched?"),
+        "contact place",
+        {word: word for word in ("all over", "centre", "left", "right", "above", "below")},
+    ),
+    "grain": Topic(
+        ("Which way does the grain run?", "What is the direction of the grain?", "How does its grain lie?"),
+        "grain",
+        {word: word for word in captions.DIRECTION_WORDS},
+    ),
+    "grasp": Topic(
+        ("Would a grasp hold?", "Could a gripper lift it by this?", "Will it slip when it is lifted?"),
+        "grasp",
+        {"hold": "hold", "slip": "slip"},
+        True,
+    ),
+}
 """By name; `answered` says what is true of each."""
 
 UNTOLD = 0.12  # share of the view in contact below which the material cannot be told
-ALL_OVER, CENTRED = 0.9, 0.12  # share above which contact is all over; distance, half views, of a contact in the centre
+ALL_OVER = 0.9  # share of the view above which contact is all over
+CENTRED = 0.12  # distance, half views, within which a contact is in the centre
 
 
 def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[str, tuple[str, str]]]:
@@ -54,7 +68,8 @@ def answered(draws: Draws, attributes: Tensor, variant: int = 0) -> list[dict[st
     depth = draws.indentation_depth * (1.0 - YIELD * draws.compliance)
     cover = attributes[:, ATTRIBUTES.index("cover")]
     holds = (grasp_margin(draws.of_material("friction"), draws.weight, depth, cover) > 1.0).tolist()
-    sentences, found = captions.described(draws, variant), []
+    sentences = captions.described(draws, variant)
+    found = []
     for row in range(len(draws)):
         spec = MATERIALS[int(draws.material[row])]
         asked = {name: topic.questions[(row + variant) % len(topic.questions)] for name, topic in TOPICS.items()}

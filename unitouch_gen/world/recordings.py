@@ -73,7 +73,8 @@ def with_recordings(seed: int, draws: Draws, sounds: Tensor, share: float) -> Te
         if (recording := recording_of(seed, name, share)) is None:
             continue
         rng = generator(seed, RECORDING_STREAM, *name, 1)
-        speed, damping = np.exp(rng.uniform(-0.1, 0.1)), rng.uniform(0.0, 2.5)
+        speed = np.exp(rng.uniform(-0.1, 0.1))
+        damping = rng.uniform(0.0, 2.5)
         samples = sounds.shape[1]
         heard = resample(recording.samples, round(len(recording.samples) / speed))[:samples]
         heard = np.pad(heard, (0, samples - len(heard))) * np.exp(-damping * np.arange(samples) / SAMPLE_RATE)
@@ -86,7 +87,9 @@ def as_files(seed: int, names: list[tuple[int, int, int]], sounds: Tensor) -> Te
     rows = sounds.numpy().copy()
     for row, name in zip(rows, names, strict=True):
         rng = generator(seed, RECORDING_STREAM, *name, 2)
-        chances, decibels, quality = rng.uniform(size=2), rng.uniform(0.0, 12.0), rng.uniform(0.2, 0.95)
+        chances = rng.uniform(size=2)
+        decibels = rng.uniform(0.0, 12.0)
+        quality = rng.uniform(0.2, 0.95)
         container, subtype = CODECS[rng.integers(len(CODECS))]
         if chances[0] < 0.25:
             most = np.abs(row).max() * 10.0 ** (-decibels / 20.0)

@@ -30,7 +30,9 @@ class Fields:
     """
 
     def __init__(self, seed: int, draws: Draws, rows: Tensor, resolution: int):
-        axis, names, base = pixel_axis(resolution), draws.names(), (BASE_RESOLUTION, BASE_RESOLUTION)
+        axis = pixel_axis(resolution)
+        names = draws.names()
+        base = (BASE_RESOLUTION, BASE_RESOLUTION)
         self.angle, self.scale, self.amplitude, self.cell_seed = (
             values[rows][:, None, None] for values in (draws.angle, draws.scale, draws.amplitude, draws.cell_seed)
         )
@@ -73,11 +75,15 @@ class Fields:
             Distances to the nearest and second nearest seed, in cells, and a uniform number in [0, 1) of the nearest.
         """
         u, v = (position / (size * self.scale) for position in at or (self.x, self.y))
-        column, row = torch.floor(u), torch.floor(v)
-        first, second, label = torch.full_like(u, 9.0), torch.full_like(u, 9.0), torch.zeros_like(u)
+        column = torch.floor(u)
+        row = torch.floor(v)
+        first = torch.full_like(u, 9.0)
+        second = torch.full_like(u, 9.0)
+        label = torch.zeros_like(u)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                i, j = column + dx, row + dy
+                i = column + dx
+                j = row + dy
                 a = hash_unit(i, j, self.cell_seed)
                 b = hash_unit(j, i, self.cell_seed + 17)
                 distance = ((i + 0.5 + (a - 0.5) - u) ** 2 + (j + 0.5 + (b - 0.5) - v) ** 2).sqrt()
@@ -89,8 +95,10 @@ class Fields:
 
 def turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """Positions (N, R, R) in a frame turned by angles (N,), of x (1, 1, R) and y (1, R, 1) moved by offsets (N, 2)."""
-    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
-    x, y = x + offset[:, 0, None, None], y + offset[:, 1, None, None]
+    cos = torch.cos(angle)[:, None, None]
+    sin = torch.sin(angle)[:, None, None]
+    x = x + offset[:, 0, None, None]
+    y = y + offset[:, 1, None, None]
     return cos * x + sin * y, -sin * x + cos * y
 
 
@@ -144,7 +152,8 @@ def relief(material: str, f: Fields) -> Relief:
             return f.amplitude * (0.05 * grain - 0.55 * hole), 0.5 * grain - 1.5 * hole
         case "plastic":  # bumps on a hexagonal lattice
             period = 2.4 * f.scale
-            a, b = TAU * f.x / period, TAU * (0.5 * f.x + 0.866 * f.y) / period
+            a = TAU * f.x / period
+            b = TAU * (0.5 * f.x + 0.866 * f.y) / period
             lattice = (torch.cos(a) + torch.cos(b) + torch.cos(a - b)) / 3.0  # three waves at 120 degrees
             return f.amplitude * 0.32 * smooth_step(lattice), 0.6 * lattice
         case "glass":  # a swell that is next to nothing
@@ -179,7 +188,8 @@ def relief(material: str, f: Fields) -> Relief:
             return f.amplitude * (0.26 * pebble + 0.03 * f.noise(4.0)), pebble - 0.6
         case "synthetic fabric":  # a plain weave: warp and weft take turns on top
             period = 1.5 * f.scale
-            a, b = math.pi * f.x / period, math.pi * f.y / period
+            a = math.pi * f.x / period
+            b = math.pi * f.y / period
             over = torch.sin(a) * torch.sin(b) > 0
             weave = torch.where(
                 over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
@@ -194,11 +204,13 @@ def relief(material: str, f: Fields) -> Relief:
             return f.amplitude * 0.30 * yarn, 0.8 * yarn
         case "rubber":  # studs on a diagonal grid
             period = 4.2 * f.scale
-            a, b = TAU * (f.x + f.y) / (1.414 * period), TAU * (f.x - f.y) / (1.414 * period)
+            a = TAU * (f.x + f.y) / (1.414 * period)
+            b = TAU * (f.x - f.y) / (1.414 * period)
             stud = torch.sigmoid(10.0 * (torch.sin(a) * torch.sin(b) - 0.12))
             return f.amplitude * 0.75 * stud, 1.2 * stud - 0.6
         case "paper":  # crumpled: |noise| folds the sheet along its zero lines
-            fold, crease = f.noise(8.0, 0.28), f.noise(6.0, 0.28, shift=1)
+            fold = f.noise(8.0, 0.28)
+            crease = f.noise(6.0, 0.28, shift=1)
             facets = -torch.minimum(fold.abs(), crease.abs())
             return f.amplitude * 0.75 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
         case "tree":  # plates of bark between furrows
@@ -226,7 +238,8 @@ def relief(material: str, f: Fields) -> Relief:
             ripple = torch.sin(TAU * (f.y + 0.8 * f.noise(10.0, 0.3, shift=1)) / (6.5 * f.scale))
             return f.amplitude * (0.26 * grain + 0.12 * ripple), 0.9 * grain - 0.4 + 0.35 * ripple
         case "rock":  # broken faces, each at a height of its own
-            swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
+            swell = f.noise(6.0, 0.4)
+            grain = f.noise(1.8, 0.9, shift=1)
             bent = f.x + 0.9 * f.scale * swell, f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2)
             first, second, label = f.cells(4.5, at=bent)
             face = smooth_step((second - first) / 0.18)

@@ -21,13 +21,15 @@ from unitouch_gen.world.grids import PATCH_MM, pixel_axis
 from unitouch_gen.world.materials import MATERIALS
 
 COLLECTION = Path(__file__).with_name("collection")
-COLOURS, HEIGHTS = ".colour.webp", ".height.webp"  # how names of files end
+COLOURS = ".colour.webp"  # suffixes of files
+HEIGHTS = ".height.webp"
 HEIGHT_RANGE = 3.2  # heights are stored in units of their deviation, from minus to plus this
 GAMMA = 1.8  # of photographs, as of the world's pictures
 
 MEASURED_WEIGHT = 3  # how often a measured surface is drawn for each time that one with computed heights is
 LARGEST_SHARE = 0.1  # of a material's objects to train on that show one surface: of few surfaces, few objects
-LOWEST_RELIEF, HIGHEST_RELIEF = 0.03, 0.6  # RMS, mm
+LOWEST_RELIEF = 0.03  # RMS, mm
+HIGHEST_RELIEF = 0.6  # RMS, mm
 CLEAR_GRAIN = 0.35  # coherence of slopes above which a surface has a direction
 
 
@@ -75,7 +77,9 @@ class ScannedSurface:
         Both are of the structure tensor, the mean outer product of its slopes.
         """
         along_y, along_x = torch.gradient(self.relief.float())
-        xx, yy, xy = (along_x**2).mean().item(), (along_y**2).mean().item(), (along_x * along_y).mean().item()
+        xx = (along_x**2).mean().item()
+        yy = (along_y**2).mean().item()
+        xy = (along_x * along_y).mean().item()
         steepest = 0.5 * math.atan2(2 * xy, xx - yy)
         return steepest + 0.5 * math.pi, math.hypot(xx - yy, 2 * xy) / max(xx + yy, 1e-9)
 
@@ -158,7 +162,8 @@ def with_scans(seed: int, draws: Draws, share: float, colours_alone: bool = Fals
         "amplitude": draws.amplitude.clone(),
     }
     for row in rows:
-        scan, (material, object_, contact) = scanned_surfaces()[numbers[row]], names[row]
+        scan = scanned_surfaces()[numbers[row]]
+        material, object_, contact = names[row]
         of_object, of_contact = (
             generator(seed, SCAN_STREAM, *name) for name in ((material, object_), (material, object_, contact))
         )
@@ -174,12 +179,14 @@ def with_scans(seed: int, draws: Draws, share: float, colours_alone: bool = Fals
             if scan.heights == "computed" and of_object.uniform() < 0.35:
                 contrast = -contrast
         # The patch lies on the scan, as far as it fits.
-        side, turn = float(columns["scan_side"][row]), float(columns["scan_turn"][row])
+        side = float(columns["scan_side"][row])
+        turn = float(columns["scan_turn"][row])
         free = max(side - PATCH_MM * (abs(math.cos(turn)) + abs(math.sin(turn))), 0.1 * side)
         place = 0.5 * side + free * of_contact.uniform(-0.5, 0.5, 2)
         columns["scan_place"][row] = torch.from_numpy(place).float()
         columns["scan_mirrored"][row] = mirrored
-        columns["scan_tint"][row], columns["scan_contrast"][row] = tint, contrast
+        columns["scan_tint"][row] = tint
+        columns["scan_contrast"][row] = contrast
         columns["grained"][row] = clear > CLEAR_GRAIN
         columns["angle"][row] += mirrored * direction
         columns["colour"][row] = (scan.mean_colour * tint).clamp(0.02, 0.98)
@@ -193,14 +200,14 @@ def with_scans(seed: int, draws: Draws, share: float, colours_alone: bool = Fals
 def scanned_patches(draws: Draws, rows: Tensor, resolution: int, *, coloured: bool) -> tuple[Tensor, Tensor | None]:
     """Heights (n, R, R), mm, and linear colours (n, 3, R, R) of the scanned contacts in some rows of draws."""
     axis = pixel_axis(resolution)
-    heights, colours = [], []
+    heights = []
+    colours = []
     for row in rows.tolist():
-        scan, side, turn = (
-            scanned_surfaces()[int(draws.surface[row])],
-            float(draws.scan_side[row]),
-            float(draws.scan_turn[row]),
-        )
-        x, y = axis[None, :], axis[:, None]
+        scan = scanned_surfaces()[int(draws.surface[row])]
+        side = float(draws.scan_side[row])
+        turn = float(draws.scan_turn[row])
+        x = axis[None, :]
+        y = axis[:, None]
         u = (math.cos(turn) * x + math.sin(turn) * y) * float(draws.scan_mirrored[row])
         v = math.cos(turn) * y - math.sin(turn) * x
         place = torch.stack([u, v], dim=-1) + draws.scan_place[row]
@@ -211,7 +218,8 @@ def scanned_patches(draws: Draws, rows: Tensor, resolution: int, *, coloured: bo
         else:
             heights.append(relief * sampled(scan.relief[None], levels[None], place / side, "bicubic")[0])
         if coloured:
-            mean, tint = scan.mean_colour[:, None], draws.scan_tint[row, :, None]
+            mean = scan.mean_colour[:, None]
+            tint = draws.scan_tint[row, :, None]
             shades = mean * (linear_levels() / mean.clamp_min(0.01)).clamp(0.15, 6.0) ** draws.scan_contrast[row] * tint
             colours.append(sampled(scan.colours, shades.clamp(0.0, 1.0), place / side, "bilinear"))
     return torch.stack(heights), torch.stack(colours) if coloured else None
@@ -229,7 +237,8 @@ def sampled(image: Tensor, values: Tensor, place: Tensor, mode: str) -> Tensor:
     size = image.shape[-1]
     pixels = place * size
     corners = pixels[[0, 0, -1, -1], [0, -1, 0, -1]]
-    low, high = corners.amin(dim=0).floor().long() - 2, corners.amax(dim=0).ceil().long() + 2
+    low = corners.amin(dim=0).floor().long() - 2
+    high = corners.amax(dim=0).ceil().long() + 2
     columns, rows = (mirrored_index(int(first), int(last), size) for first, last in zip(low, high, strict=True))
     crop = image[:, rows][:, :, columns].long()
     found = torch.stack([levels[channel] for levels, channel in zip(values, crop, strict=True)])[None]

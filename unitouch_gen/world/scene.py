@@ -81,9 +81,15 @@ class World:
     take = 0  # another number takes other photos of the same contacts
 
     def __init__(
-        self, seed: int = 0, *, image_size: int = 128, scanned: float = 0.0, photographic: float = 0.0,
-        recordings: float = 0.0, colours_alone: bool = False,
-    ):  # fmt: skip
+        self,
+        seed: int = 0,
+        *,
+        image_size: int = 128,
+        scanned: float = 0.0,
+        photographic: float = 0.0,
+        recordings: float = 0.0,
+        colours_alone: bool = False,
+    ):
         self.seed = check_integer("seed", seed, 0)
         self.scanned = check_number("scanned", scanned, 0.0, 1.0)
         self.photographic = check_number("photographic", photographic, 0.0, 1.0)
@@ -95,10 +101,14 @@ class World:
 
     @torch.no_grad()
     def render(
-        self, material: Sequence[int] | Tensor, object: Sequence[int] | Tensor, contact: Sequence[int] | Tensor, *,
+        self,
+        material: Sequence[int] | Tensor,
+        object: Sequence[int] | Tensor,
+        contact: Sequence[int] | Tensor,
+        *,
         modalities: Sequence[str] = ("image", "touch", "audio", "text"),
         sensors: Sequence[str | Sensor] = ("gelsight",),
-    ) -> Scene:  # fmt: skip
+    ) -> Scene:
         """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
 
         Args:
@@ -115,20 +125,24 @@ class World:
         """
         # 1. Check, and draw the numbers of the contacts.
         asked = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
-        by, material = _sensors(sensors), _numbers("material", material, most=len(MATERIALS) - 1)
-        object, contact = _numbers("object", object, len(material)), _numbers("contact", contact, len(material))
+        by = _sensors(sensors)
+        material = _numbers("material", material, most=len(MATERIALS) - 1)
+        object = _numbers("object", object, len(material))
+        contact = _numbers("contact", contact, len(material))
         draws = self.draw(material, object, contact)
         names = [scanned_surfaces()[number].name if number >= 0 else None for number in draws.surface.tolist()]
         scene = Scene(material, object, contact, names)
         scene.left_out = [name for name in MODALITIES if name not in asked]
 
         # 2. Surfaces and their pictures.
-        coloured, size = "image" in asked, self.image_size
+        coloured = "image" in asked
+        size = self.image_size
         if asked - {"audio", "text"}:
             built = surfaces(self.seed, draws, self.resolution, coloured=coloured)
             # Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
             stiff = 1.0 - YIELD * draws.compliance
-            height, depth = built.height * stiff[:, None, None], draws.indentation_depth * stiff
+            height = built.height * stiff[:, None, None]
+            depth = draws.indentation_depth * stiff
             scene.left_out += [] if coloured else ["colours of surfaces"]
         else:
             scene.left_out.append("surfaces")
@@ -147,7 +161,8 @@ class World:
             if "depth" in asked:
                 scene.depth[sensor.name] = in_view(displacement, size)
             if "attributes" in asked:
-                pressed, view = in_view(indentation, size), sensor.field_of_view
+                pressed = in_view(indentation, size)
+                view = sensor.field_of_view
                 scene.attributes[sensor.name] = contact_attributes(pressed, view, draws.compliance)
 
         # 4. Grasps, sounds and captions.

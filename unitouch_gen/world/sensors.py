@@ -91,7 +91,8 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     hues = rng.uniform() + (np.arange(lights) + rng.uniform(-0.15, 0.15, lights)) / lights
     colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights))
     colours = colours * rng.uniform(0.6, 1.0, (lights, 1))
-    view, nearly = log_uniform(rng, 10.0, 20.0), float(rng.uniform(0.88, 1.125))
+    view = log_uniform(rng, 10.0, 20.0)
+    nearly = float(rng.uniform(0.88, 1.125))
     view = view if near is None else near * nearly
     follows = rng.uniform() < 0.65
     uneven = rng.uniform(0.0, 0.5)
@@ -130,14 +131,18 @@ def _rgb(hue: np.ndarray, saturation: np.ndarray) -> np.ndarray:
 def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """An untouched gel (3, 12, 12): a base colour, a glow from each light and in the middle, and a vignette."""
     axis = (np.arange(12) + 0.5) / 12 * 2.0 - 1.0
-    x, y = axis[None, :], axis[:, None]
+    x = axis[None, :]
+    y = axis[:, None]
     field = rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) * np.ones((3, 12, 12))
     glow = rng.uniform(0.0, 0.45)
     for azimuth, colour in zip(np.radians(azimuths), colours, strict=True):
-        out, width = rng.uniform(0.4, 1.3), rng.uniform(0.4, 1.2)
+        out = rng.uniform(0.4, 1.3)
+        width = rng.uniform(0.4, 1.2)
         lobe = np.exp(-((x - out * np.cos(azimuth)) ** 2 + (y - out * np.sin(azimuth)) ** 2) / width**2)
         field = field + glow * rng.uniform(0.3, 1.0) * (colour - 0.4)[:, None, None] * lobe
-    cx, cy, width = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(0.4, 1.2)
+    cx = rng.uniform(-0.3, 0.3)
+    cy = rng.uniform(-0.3, 0.3)
+    width = rng.uniform(0.4, 1.2)
     middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
     field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
     field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))

@@ -119,10 +119,12 @@ def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor) -> Te
         rng = generator(seed, ROOM_STREAM, *name, 1)
         wave = -2j * np.pi * hz
         delays = rng.uniform(0.001, 0.06, 4)
-        wet, room = math.exp(rng.uniform(math.log(0.02), math.log(0.4))), rng.uniform(0.005, 0.05)
+        wet = math.exp(rng.uniform(math.log(0.02), math.log(0.4)))
+        room = rng.uniform(0.005, 0.05)
         gains = wet * rng.normal(size=4) * np.exp(-delays / room)
         room_response = np.exp(wave * rng.uniform(0.0, 0.02)) * (1.0 + np.exp(np.outer(wave, delays)) @ gains)
-        low, high = math.exp(rng.uniform(math.log(20.0), math.log(150.0))), rng.uniform(4000.0, 8000.0)
+        low = math.exp(rng.uniform(math.log(20.0), math.log(150.0)))
+        high = rng.uniform(4000.0, 8000.0)
         tilt = rng.uniform(-2.0, 2.0) / (20.0 * math.log10(2.0))
         microphone = np.maximum(hz, 1.0) / 1000.0
         microphone = microphone**tilt / np.sqrt((1.0 + (low / np.maximum(hz, 1.0)) ** 4) * (1.0 + (hz / high) ** 4))

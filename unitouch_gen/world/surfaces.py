@@ -29,12 +29,14 @@ class Surfaces:
 def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True) -> Surfaces:
     """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
     axis = pixel_axis(resolution)
-    x, y = axis[None, None, :], axis[None, :, None]
+    x = axis[None, None, :]
+    y = axis[None, :, None]
     u, v = turned(x, y, draws.shape_angle, -draws.shape_offset)
     height = torch.zeros_like(u)
     for index in draws.shape.unique().tolist():
         rows = torch.nonzero(draws.shape == index)[:, 0]
-        size, numbers = draws.shape_radius[rows, None, None], draws.proportions[rows, :, None, None]
+        size = draws.shape_radius[rows, None, None]
+        numbers = draws.proportions[rows, :, None, None]
         height[rows] = body(list(SHAPES)[index], u[rows], v[rows], size, numbers)
     there = (height > DEEPEST_GROUND).float()
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
@@ -47,7 +49,8 @@ def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True)
         if albedo is not None:
             albedo[rows] = colours
     for index in draws.material[drawn].unique().tolist():
-        material, rows = MATERIALS[index], torch.nonzero(drawn & (draws.material == index))[:, 0]
+        material = MATERIALS[index]
+        rows = torch.nonzero(drawn & (draws.material == index))[:, 0]
         raised[rows], shade = relief(material.name, Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)
