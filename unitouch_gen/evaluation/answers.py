@@ -32,11 +32,14 @@ def caption_table(pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Te
         embed: Gives unit embeddings of texts, for the zero-shot classifier.
     """
     test = splits["test"]
-    names, rows = test.classes.get("material", ()), some(test, each)
-    truths, before = test.asked(), splits["train"].asked()
+    names = test.classes.get("material", ())
+    rows = some(test, each)
+    truths = test.asked()
+    before = splits["train"].asked()
     asked = [truths[row] for row in rows.tolist()]
     usual = {topic: Counter(one[topic][1][0] for one in before) for topic in asked[0]}
-    pixels, known = float_pixels(test.touch[rows.numpy()]), [test.sensors[row] for row in rows.tolist()]
+    pixels = float_pixels(test.touch[rows.numpy()])
+    known = [test.sensors[row] for row in rows.tolist()]
     touch = in_batches(len(rows), lambda part: pipe.encode_touch(pixels[part], known[part]))
     embeds = {"touch": touch, "shuffled touches": touch[others(len(touch))]}
     if "image" in test.features:

@@ -85,7 +85,10 @@ def embed(
     "statistics" of the touch, an "untrained" encoder, the untouched "gel", and "supervised", a classifier of touches
     trained with labels.
     """
-    touch, gel, sensors, known = contacts.touch, contacts.gel, contacts.sensors, model.known_modalities
+    touch = contacts.touch
+    gel = contacts.gel
+    sensors = contacts.sensors
+    known = model.known_modalities
     at_rest = np.broadcast_to(np.mean(touch, axis=0, dtype=np.float32), touch.shape) if gel is None else gel
 
     def plain(rows: slice) -> np.ndarray:

@@ -29,7 +29,8 @@ def touch_to_image_table(
     of the training split. The ceiling is the real picture, which the world shows under another lamp. Measures are
     fitted to the split "train", and `each` contacts of each material of "test" are drawn.
     """
-    train, test = splits["train"], splits["test"]
+    train = splits["train"]
+    test = splits["test"]
     rows = some(test, each)
     embeds = beside_class_means(pipe.encode_touch, "touch", test.touch, test, rows)
     made = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
@@ -44,7 +45,8 @@ def x_to_touch_table(pipe: Any, splits: Splits, classifiers: Classifiers, each: 
 
     The ceiling is the real touch, which the world shows by another sensor.
     """
-    test, figures = splits["test"], dict[str, Figures]()
+    test = splits["test"]
+    figures = dict[str, Figures]()
     rows = some(test, each)
     ceiling = float_pixels((test.touch if test.second is None else test.second)[rows.numpy()])
     measure = measures_of(splits, classifiers, "touch", rows)
@@ -100,10 +102,14 @@ def measures_of(splits: Splits, classifiers: Classifiers, modality: str, rows: T
     - "contact": share that is nearest to its own real image among those of a material.
     - "distance": Frechet's to real images of other contacts.
     """
-    train, test, classifier = splits["train"], splits["test"], classifiers[modality]
+    train = splits["train"]
+    test = splits["test"]
+    classifier = classifiers[modality]
     other = "touch" if modality == "image" else "image"
-    real, material = getattr(test, modality), test.material.unique(return_inverse=True)[1]
-    remaining, size = sorted({*range(len(real))} - {*rows.tolist()}), min(64, int(torch.bincount(material).min()))
+    real = getattr(test, modality)
+    material = test.material.unique(return_inverse=True)[1]
+    remaining = sorted({*range(len(real))} - {*rows.tolist()})
+    size = min(64, int(torch.bincount(material).min()))
     gallery, features = read(classifier, real)
     paired = train.image is not None and test.image is not None
     if paired:
@@ -135,5 +141,6 @@ def read(classifier: ContactClassifier, images: Any) -> tuple[Tensor, Tensor]:
         said: Any = classifier.observe(float_pixels(images[part]))
         return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation, said.features], dim=1)
 
-    found, width = in_batches(len(images), observe), int(classifier.config.num_labels or 0) + len(mean)
+    found = in_batches(len(images), observe)
+    width = int(classifier.config.num_labels or 0) + len(mean)
     return found[:, :width], found[:, width:]

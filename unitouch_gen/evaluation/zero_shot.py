@@ -61,13 +61,19 @@ class ZeroShotTouchClassifier:
     """
 
     def __init__(self, model: UniTouchModel, processor: UniTouchProcessor):
-        self.model, self.processor = model, processor
+        self.model = model
+        self.processor = processor
 
     @torch.no_grad()
     def __call__(
-        self, touch: ImageInput, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None, *,
-        sensor: str | Sequence[str | None] | None = None, top: int | None = None,
-    ) -> list[Named]:  # fmt: skip
+        self,
+        touch: ImageInput,
+        labels: Sequence[str] = MATERIAL_NAMES,
+        template: str | None = None,
+        *,
+        sensor: str | Sequence[str | None] | None = None,
+        top: int | None = None,
+    ) -> list[Named]:
         """The labels of each touch with their probabilities, best first.
 
         Args:
@@ -80,7 +86,8 @@ class ZeroShotTouchClassifier:
         Raises:
             InvalidInputError, InvalidTypeError: If an argument cannot be used.
         """
-        names, template = check_texts("labels", labels), template or PROMPTS["touch"]
+        names = check_texts("labels", labels)
+        template = template or PROMPTS["touch"]
         if len(names) < 2 or len({*names}) < len(names) or not all(name.strip() for name in names):
             raise InvalidInputError(f"`labels` is {names}; pass two or more names, each once and none of them blank.")
         if [check_kind("template", template, str).count(part) for part in ("{}", "{", "}")] != [1, 1, 1]:

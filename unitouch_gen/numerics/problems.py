@@ -114,11 +114,17 @@ class Problem:
         return predict
 
     def run(
-        self, noise: Tensor, solver: str | None = None, network: Network | None = None, scheduler: Any = None,
-        throw: bool = True, **steps: Any,
-    ) -> tuple[Tensor, RunReport]:  # fmt: skip
+        self,
+        noise: Tensor,
+        solver: str | None = None,
+        network: Network | None = None,
+        scheduler: Any = None,
+        throw: bool = True,
+        **steps: Any,
+    ) -> tuple[Tensor, RunReport]:
         """Latents and report of one run from unit-variance noise; `steps` are arguments of `prepare_steps`."""
-        report, network = RunReport(), network or self.network(len(noise))
+        report = RunReport()
+        network = network or self.network(len(noise))
         made = prepare_steps(scheduler or self.scheduler(), solver=solver, **steps)
         with report.stage("denoising"):
             return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
@@ -176,7 +182,8 @@ def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float
         denoised = denoise(torch.from_numpy(z.reshape(x.shape)) / alpha(sigma), sigma)
         return alpha(sigma) ** 2 * z - alpha(sigma) * denoised.numpy().reshape(-1)
 
-    levels, start = [math.log(sigma) for sigma in sigmas], (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
+    levels = [math.log(sigma) for sigma in sigmas]
+    start = (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
     # Its norm is over the whole batch: divided by sqrt(B), no sample errs by more, even if all of the error is its own.
     tolerance = max(rtol / math.sqrt(len(x)), 1e-13)
     found = solve_ivp(slope, (levels[0], levels[-1]), start, "DOP853", levels, rtol=tolerance, atol=tolerance)
@@ -200,7 +207,8 @@ def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMi
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
 
-WIDE, NARROW = gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.275, largest=0.25)
+WIDE = gaussian(0.1, mean=0.2)
+NARROW = gaussian(0.025, mean=0.275, largest=0.25)
 FEW_LEVELS = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
 COSINE = {"beta_schedule": "squaredcos_cap_v2"}  # from noise level 20 000
 ZERO_SNR = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}  # from noise level 4096

@@ -68,7 +68,8 @@ def within(problem: Problem, tolerance: float = 0.01) -> float:
     """A tolerance, and on Gaussian data the error of the step to sigma = 0 along the exact flow."""
     if not problem.is_gaussian:
         return tolerance
-    noise, last = problem.noise(4), problem.schedule.sigma_min
+    noise = problem.noise(4)
+    last = problem.schedule.sigma_min
     ends = [2 * last, last]
     levels = [(sigma, problem.denoise(x, sigma)) for sigma, x in zip(ends, problem.path(noise, ends), strict=True)]
     return tolerance + relative_rms(denoised_at_zero(levels), problem.solution(noise)).max().item()
@@ -76,7 +77,8 @@ def within(problem: Problem, tolerance: float = 0.01) -> float:
 
 def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Case]:
     """Extreme guidance and latents, and half precision in calls of a pipeline."""
-    touch, photo = example("brick"), example("wood", "image")
+    touch = example("brick")
+    photo = example("wood", "image")
     of_kinds: dict[str, dict[str, Any]] = {
         "touch-to-image": {"touch": touch},
         "stylization": {"touch": touch, "image": photo},
@@ -87,7 +89,8 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
         """Latents and codes of one call, from latents that are plus or minus a size everywhere."""
         pipe = load(dtype)
         pipe.set_progress_bar_config(disable=True)
-        shape, side = (1, pipe.unet.config.out_channels, 8, 8), 8 * pipe.vae_scale_factor
+        shape = (1, pipe.unet.config.out_channels, 8, 8)
+        side = 8 * pipe.vae_scale_factor
         latents = size * torch.randn(shape, generator=torch.Generator().manual_seed(1)).sign()
         given = {"num_inference_steps": 2, "guidance_scale": 2.0, "latents": latents, "height": side, "width": side}
         given |= {"output_type": "latent", "throw": False, "generator": torch.Generator().manual_seed(0)}

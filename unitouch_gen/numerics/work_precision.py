@@ -74,18 +74,27 @@ def problem_target(problem: Problem, seeds: int = 8) -> Target:
 
     def run(solver: str, steps: int | None, tolerance: float | None) -> tuple[Tensor, RunReport]:
         latents, report = problem.run(
-            noise, solver if solver in SOLVERS else None, scheduler=scheduler_of(solver, problem.scheduler()),
-            num_inference_steps=steps, tolerance=tolerance, throw=False,
-        )  # fmt: skip
+            noise,
+            solver if solver in SOLVERS else None,
+            scheduler=scheduler_of(solver, problem.scheduler()),
+            num_inference_steps=steps,
+            tolerance=tolerance,
+            throw=False,
+        )
         return latents[[code.finite for code in report.codes]], report
 
     return Target(problem.name, run, problem.guidance_scale, problem.solution(noise))
 
 
 def pipeline_target(
-    pipe: Any, inputs: Mapping[str, Tensor], *, name: str = "", seeds: int = 2, guidance_scale: float | None = None,
+    pipe: Any,
+    inputs: Mapping[str, Tensor],
+    *,
+    name: str = "",
+    seeds: int = 2,
+    guidance_scale: float | None = None,
     turbo: Any = None,
-) -> Target:  # fmt: skip
+) -> Target:
     """Calls of a pipeline under conditions, from some noises each.
 
     The reference is 400 steps of UniPC, its own error the distance of 200 steps to it. A trained network ripples with
@@ -110,10 +119,16 @@ def pipeline_target(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnfamiliarInputWarning)
             output = called(
-                **inputs, num_images_per_prompt=seeds, solver=solver if solver in SOLVERS else None,
-                num_inference_steps=steps, tolerance=tolerance, guidance_scale=1.0 if solver == "turbo" else scale,
-                generator=torch.Generator().manual_seed(0), output_type="latent", throw=throw,
-            )  # fmt: skip
+                **inputs,
+                num_images_per_prompt=seeds,
+                solver=solver if solver in SOLVERS else None,
+                num_inference_steps=steps,
+                tolerance=tolerance,
+                guidance_scale=1.0 if solver == "turbo" else scale,
+                generator=torch.Generator().manual_seed(0),
+                output_type="latent",
+                throw=throw,
+            )
         return output.images.cpu(), output.report
 
     most = min(400, pipe.scheduler.config.num_train_timesteps)
@@ -146,7 +161,8 @@ def measure(
     except Exception as error:  # the other points are worth having, and this one says what it was
         return {**row, "failures": samples, "reason": f"{type(error).__name__}: {first_line(error)}"}
     latents, report = runs[-1]
-    finite, failed = ([code.finite for code in report.codes], [code for code in report.codes if code != "success"])
+    finite = [code.finite for code in report.codes]
+    failed = [code for code in report.codes if code != "success"]
     errors = relative_rms(latents, target.truth[finite]).numpy()
     if len(errors):
         row |= zip(("error_low", "error", "error_high"), np.quantile(errors, (0.25, 0.5, 0.75)).tolist(), strict=True)
@@ -192,14 +208,21 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
     axes.set(xscale=scale, yscale=scale, xlabel=words)
     axes.grid(color="#d9d9d9")
     front = pareto_front(rows, cost)
-    axes.plot([row[cost] for row in front], [row["error"] for row in front], "y-", linewidth=11, alpha=0.4,
-              label="Pareto front")  # fmt: skip
+    axes.plot(
+        [row[cost] for row in front],
+        [row["error"] for row in front],
+        "y-",
+        linewidth=11,
+        alpha=0.4,
+        label="Pareto front",
+    )
     for row in front:
         axes.annotate(str(row["steps"] or row["tolerance"]), (row[cost], row["error"]))
     for solver in dict.fromkeys(row["solver"] for row in rows):
         known = sorted((row for row in good(rows) if row["solver"] == solver), key=lambda row: row[cost])
         x, low, error, high = ([row[key] for row in known] for key in (cost, "error_low", "error", "error_high"))
-        bars, colour = (np.subtract(error, low), np.subtract(high, error)), f"C{NAMES.index(solver)}"
+        bars = (np.subtract(error, low), np.subtract(high, error))
+        colour = f"C{NAMES.index(solver)}"
         label = f"{solver} (adds noise)" if known and known[0]["noisy"] else solver
         axes.errorbar(x, error, yerr=bars, fmt="o-", color=colour, capsize=2, label=label)
         for row in known:
@@ -217,8 +240,13 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
 
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
     """Writes `results.json` and `chart.png`."""
-    values = {"target": target.name, "guidance_scale": target.guidance_scale, "own_error": target.own_error,
-              "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "rows": list(rows)}  # fmt: skip
+    values = {
+        "target": target.name,
+        "guidance_scale": target.guidance_scale,
+        "own_error": target.own_error,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "rows": list(rows),
+    }
     picture = io.BytesIO()
     draw_chart(target, rows).savefig(picture, format="png", dpi=160, facecolor="white")
     contents: dict[str, str | bytes] = {"results.json": json.dumps(values, indent=1), "chart.png": picture.getvalue()}
