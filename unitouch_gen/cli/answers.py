@@ -14,9 +14,12 @@ def ask(
     question: Annotated[str, Argument(help="What to ask about each.")],
     model: options.Model = None,
     max_new_tokens: Annotated[int | None, Option(min=1, help="Of an answer; the model's own if left out.")] = None,
-    sensor: options.Sensor = None, seed: options.Seed = 0, dtype: options.Dtype = None,
-    device: options.Device = "auto", as_json: options.AsJson = False,
-) -> None:  # fmt: skip
+    sensor: options.Sensor = None,
+    seed: options.Seed = 0,
+    dtype: options.Dtype = None,
+    device: options.Device = "auto",
+    as_json: options.AsJson = False,
+) -> None:
     """Answers a question about each touch.
 
     Example: unitouch-gen ask example:brick "How does it feel?"
@@ -43,8 +46,9 @@ def classify(
     sensor: options.Sensor = None,
     top: Annotated[int, Option(min=1, help="How many labels are printed for each.")] = 3,
     model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
-    device: options.Device = "auto", as_json: options.AsJson = False,
-) -> None:  # fmt: skip
+    device: options.Device = "auto",
+    as_json: options.AsJson = False,
+) -> None:
     """Says what each touch is most likely of, zero-shot, or that the model does not know it.
 
     Example: unitouch-gen classify example:brick example:wood --labels brick,wood,grass

@@ -26,10 +26,15 @@ def batch(
     source: Annotated[Path, Argument(help="A .csv with a line for each picture, or a folder.")],
     output: Annotated[Path, Option("--output", "-o", help="A folder; pictures that are there stay.")],
     pipeline: Annotated[str, Option(help=f"{', '.join(DRAWING)}.")] = "touch-to-image",
-    sensor: options.Sensor = None, num_inference_steps: options.Steps = None, settings: options.Settings = None,
-    seed: options.Seed = 0, batch_size: options.BatchSize = 8, model: options.Model = None,
-    dtype: options.Dtype = None, device: options.Device = "auto",
-) -> None:  # fmt: skip
+    sensor: options.Sensor = None,
+    num_inference_steps: options.Steps = None,
+    settings: options.Settings = None,
+    seed: options.Seed = 0,
+    batch_size: options.BatchSize = 8,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    device: options.Device = "auto",
+) -> None:
     """Makes the pictures of a table or a folder that are not there yet; exits with 1 if some fail.
 
     Processes that torchrun or accelerate launch starts share the work.
@@ -50,7 +55,8 @@ def batch(
     from unitouch_gen.pipelines.tiny import PIPELINES
 
     kind = PIPELINES[pipeline]
-    shared, known = options.call_arguments(context, kind), inspect.signature(kind.__call__).parameters
+    shared = options.call_arguments(context, kind)
+    known = inspect.signature(kind.__call__).parameters
     columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
     folder = source if source.is_dir() else source.parent
     rows = [{"seed": str(seed), **{column: cell for column, cell in row.items() if cell}} for row in rows]
@@ -59,7 +65,8 @@ def batch(
     options.check_output([manifest], overwrite=True)
     end_last_line(manifest)
 
-    state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
+    state = PartialState(cpu=not torch.cuda.is_available())
+    failed = list[str]()
     most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
     alike: dict[tuple[str, ...], list[Picture]] = {}  # of the same kinds of inputs
     for one in (picture for picture in pictures if not picture.file.exists()):
@@ -120,7 +127,8 @@ def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: 
 
     Names of files in the rows start from a folder.
     """
-    names, pictures = list[str](), list[Picture]()
+    names = list[str]()
+    pictures = list[Picture]()
     for row in rows:
         for column in row:
             check_choice("column", column, columns)

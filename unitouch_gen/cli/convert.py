@@ -21,7 +21,7 @@ def unitouch(
     tokenizer: Annotated[Path | None, Option(exists=True, help="Folder `tokenizer` of SD 2.1 unCLIP.")] = None,
     dtype: Annotated[str | None, Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
     config: Annotated[Path | None, Option(**FILE, help="config.json of encoders of another size.")] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Converts the checkpoints of UniTouch and ImageBind.
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch

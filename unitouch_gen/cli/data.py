@@ -43,7 +43,8 @@ def check(
         same[blake2b(record.touch.read().contiguous().numpy().tobytes()).digest()].append(row)
 
     broken = for_each(read, data, is_quiet(False))
-    counts, lines = Counter[tuple[str, str]](), [*data.notes]
+    counts = Counter[tuple[str, str]]()
+    lines = [*data.notes]
     for record in data.records:
         counts.update([("", "all"), ("sensor", record.sensor or "unknown"), ("split", record.split or "none")])
         counts.update(("with", name) for name in ("picture", "background", "caption", "sound") if getattr(record, name))

@@ -48,8 +48,9 @@ def evaluate(
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
     each: Annotated[int, Option(min=2, max=10_000, help="Contacts of each material that images are made of.")] = 4,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
-    device: options.Device = "auto", overwrite: options.Overwrite = False,
-) -> None:  # fmt: skip
+    device: options.Device = "auto",
+    overwrite: options.Overwrite = False,
+) -> None:
     """Makes a table of the paper, each figure beside chance, majority, plain statistics and an untrained encoder.
 
     Example: unitouch-gen evaluate material -o tables/
@@ -68,7 +69,8 @@ def evaluate(
     joint, processor = load_joint_space(model, device)
     check_table(table, joint, pipe, folders, each)
     with TemporaryDirectory(prefix="unitouch-") as scratch:
-        place, started = cache or Path(scratch), time.perf_counter()
+        place = cache or Path(scratch)
+        started = time.perf_counter()
         if folders:
             sets = of_datasets(place, joint, processor, folders)
         else:

@@ -104,7 +104,8 @@ def load_pipeline(
 ) -> Any:
     """A pipeline, by its built-in name and a command's options: of a folder or repository, or built in."""
     check_arguments("`load_pipeline`", unknown, ("model", "dtype", "device", "quiet"))
-    weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
+    weights_dtype = check_dtype("--dtype", dtype or "float32")
+    place = device_of(device)
     import diffusers.utils.logging
     import transformers.utils.logging
 
@@ -136,7 +137,8 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     take_one_thread(model)
     folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
-        joint, processor = folder / "unitouch", folder / "processor"
+        joint = folder / "unitouch"
+        processor = folder / "processor"
     with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 

@@ -61,7 +61,8 @@ def work_precision(
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
         name = check_choice("--pipeline", pipeline, DRAWING)
-        pipe, inputs = load_pipeline(name, model=model), wp.world_inputs(DRAWING[name], 4)
+        pipe = load_pipeline(name, model=model)
+        inputs = wp.world_inputs(DRAWING[name], 4)
         turbo = None
         if lora is not None and "turbo" in names:
             with reading("--lora", lora):
@@ -73,7 +74,8 @@ def work_precision(
     rows = [wp.measure(target, **point) for point in tqdm(points, disable=None)]
     wp.save(output, target, rows)
     echo(f"{target.name}, guidance {target.guidance_scale:g}; the reference's own error is {target.own_error:.1e}")
-    reached, table = (0.2, 0.1, 0.05, 0.02, 0.01), list[list[str]]()
+    reached = (0.2, 0.1, 0.05, 0.02, 0.01)
+    table = list[list[str]]()
     for name in names:
         own = sorted((row for row in wp.good(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
         enough = [next((row for row in own if row["error"] <= error), None) for error in reached]
@@ -105,16 +107,19 @@ def stability(
     known = {case.name: case for case in cases(load, [*DRAWING] if model is None else [kind_of(model)])}
     table = [*known.values()] if only is None else [known[check_choice("--only", only, known)]]
     diffusers.utils.logging.set_verbosity_error()
-    rows, failed = [], 0
+    rows = []
+    failed = 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of extreme input
         for case in tqdm(table, disable=None, leave=False):
             try:
                 value, bound = case.run()
             except Exception as error:  # the other cases still run
-                ok, figures = False, ["-", f"{type(error).__name__}: {error}"]
+                ok = False
+                figures = ["-", f"{type(error).__name__}: {error}"]
             else:
-                ok, figures = value <= bound, [f"{bound:.2g}", f"{value:.2g}"]
+                ok = value <= bound
+                figures = [f"{bound:.2g}", f"{value:.2g}"]
             failed += not ok
             rows.append([case.name, case.reason, *figures, "ok" if ok else "FAILED"])
     print_table(["case", "reason of the bound", "bound", "result", ""], rows)

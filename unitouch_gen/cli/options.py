@@ -14,15 +14,31 @@ from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import check_writable
 
 SETTABLE = (
-    "bridge", "eta", "guidance_scale", "height", "init_strength", "keep_colours", "layout", "max_evaluations", "mix",
-    "noise_level", "num_inference_steps", "solver", "strength", "tolerance", "touch_weight", "weights", "width",
-)  # fmt: skip
+    "bridge",
+    "eta",
+    "guidance_scale",
+    "height",
+    "init_strength",
+    "keep_colours",
+    "layout",
+    "max_evaluations",
+    "mix",
+    "noise_level",
+    "num_inference_steps",
+    "solver",
+    "strength",
+    "tolerance",
+    "touch_weight",
+    "weights",
+    "width",
+)
 """Arguments of pipelines' calls that are the same for all pictures of a call."""
 
 MAX_SEED = 2**32 - 1  # torch's generators of the CPU start from 32 bits: 2**32 would draw what 0 does
 
 FILE = {"exists": True, "dir_okay": False}
-A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns or example:NAME"
+A_FOLDER = "Folder or repository id of"
+SEVERAL = "files, folders, patterns or example:NAME"
 
 # Inputs and outputs
 Touches = Annotated[list[str], Argument(help=f"Touch images, or videos: {SEVERAL}.")]

@@ -279,7 +279,8 @@ def upload(modality: str, label: str) -> Any:
 
 def solver_fields(pipe: Any) -> Fields:
     """Fields of all tabs."""
-    steps, guidance = pipe.config.default_num_inference_steps, pipe.config.default_guidance_scale
+    steps = pipe.config.default_num_inference_steps
+    guidance = pipe.config.default_guidance_scale
     with gradio.Accordion("Solver, seed, number of pictures", open=False):
         return {
             "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),

@@ -23,15 +23,29 @@ from unitouch_gen.files import replacing
 
 
 def touch_to_image(
-    context: Context, touch: options.Touches, output: options.Output,
-    prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
-    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None, settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, dtype: options.Dtype = None,
-    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
-) -> None:  # fmt: skip
+    context: Context,
+    touch: options.Touches,
+    output: options.Output,
+    prompt: options.Prompt = None,
+    negative_prompt: options.NegativePrompt = None,
+    strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None,
+    sensor: options.Sensor = None,
+    background: options.Background = None,
+    num_inference_steps: options.Steps = None,
+    solver: options.Solver = None,
+    tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None,
+    settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1,
+    seed: options.Seed = 0,
+    batch_size: options.BatchSize = 8,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    device: options.Device = "auto",
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+) -> None:
     """Makes a picture of what each touch feels like.
 
     Example: unitouch-gen touch-to-image example:brick example:wood -o pictures/
@@ -45,18 +59,31 @@ def touch_to_image(
 def stylize(
     context: Context,
     image: Annotated[str, Argument(help="The photo: a file or example:NAME.")],
-    touch: options.Touches, output: options.Output,
+    touch: options.Touches,
+    output: options.Output,
     touch_weight: Annotated[float | None, Option(min=0, max=1, help="Share of the touch, by default 0.7.")] = None,
     layout: Annotated[int, Option(min=2, help="Cells along a side of the grid on which the photo is held.")] = 14,
     keep_colours: Annotated[bool, Option("--keep-colours", metavar="", help="Hold its mean colour, too.")] = False,
-    prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
-    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None, settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, dtype: options.Dtype = None,
-    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
-) -> None:  # fmt: skip
+    prompt: options.Prompt = None,
+    negative_prompt: options.NegativePrompt = None,
+    strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None,
+    sensor: options.Sensor = None,
+    background: options.Background = None,
+    num_inference_steps: options.Steps = None,
+    solver: options.Solver = None,
+    tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None,
+    settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1,
+    seed: options.Seed = 0,
+    batch_size: options.BatchSize = 8,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    device: options.Device = "auto",
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+) -> None:
     """Restyles a photo by each touch.
 
     Example: unitouch-gen stylize example:wood example:gravel -o restyled.png
@@ -72,7 +99,8 @@ def stylize(
 
 
 def x_to_touch(
-    context: Context, output: options.Output,
+    context: Context,
+    output: options.Output,
     image: Annotated[list[str] | None, Option(help=f"A photo to make a touch of: {SEVERAL}; repeatable.")] = None,
     text: Annotated[list[str] | None, Option(help="A description to make a touch of; repeatable.")] = None,
     audio: Annotated[list[str] | None, Option(help=f"A sound to make a touch of: {SEVERAL}; repeatable.")] = None,
@@ -80,12 +108,20 @@ def x_to_touch(
     source_sensor: Annotated[str | None, Option(help="Sensor that took --touch; by its looks if left out.")] = None,
     sensor: Annotated[list[str] | None, Option(help="Sensor to draw for, the first, or all; repeatable.")] = None,
     background: options.Background = None,
-    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None, settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
-    model: options.Model = None, dtype: options.Dtype = None,
-    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
-) -> None:  # fmt: skip
+    num_inference_steps: options.Steps = None,
+    solver: options.Solver = None,
+    tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None,
+    settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1,
+    seed: options.Seed = 0,
+    batch_size: options.BatchSize = 8,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    device: options.Device = "auto",
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor.
 
     Several inputs of one option make a touch each, and go in pairs, or all with one, with those of the others. Pictures
@@ -136,7 +172,8 @@ def stem_of(value: Path | str) -> str:
 def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) -> list[Picture]:
     """The pictures of rows of inputs and the names of their files; refuses what cannot be written."""
     given = context.params
-    output, images = Path(given["output"]), given["num_images_per_prompt"]
+    output = Path(given["output"])
+    images = given["num_images_per_prompt"]
     each = [(inputs, stem, number) for inputs, stem in rows for number in range(images)]
     stems = unique([f"{stem}-{number + 1}" if images > 1 else stem for _, stem, number in each])
     files = [output / f"{stem}.png" for stem in stems]
@@ -157,7 +194,8 @@ def unique(names: Sequence[str]) -> list[str]:
     """Names, repeated ones with a number, so that no file replaces another, not even where case is ignored."""
     found: dict[str, str] = {}
     for name in names:
-        free, count = name, 1
+        free = name
+        count = 1
         while free.casefold() in found:
             count += 1
             free = f"{name}-{count}"
@@ -192,9 +230,12 @@ def described(picture: Picture, report: Any, place: int) -> dict[str, Any]:
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by a command's options, saves those of each call, and prints a table of them and the report."""
-    given, rows, reports = context.params, list[dict[str, Any]](), list[Any]()
+    given = context.params
+    rows = list[dict[str, Any]]()
+    reports = list[Any]()
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
-    processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
+    processor = pipe.processor
+    quiet = options.is_quiet(given["as_json"])
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
     for picture in pictures:  # an input that cannot be read should not end the work of hours
         for name in read.keys() & picture.inputs.keys():
