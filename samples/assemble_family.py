@@ -21,8 +21,12 @@ from unitouch_gen.training.touch_llm import PROMPT
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
-TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 10,
-                  "default_noise_level": 150}  # fmt: skip
+TOUCH_TO_IMAGE = {
+    "default_strength": 1.0,
+    "default_guidance_scale": 4.0,
+    "default_num_inference_steps": 10,
+    "default_noise_level": 150,
+}
 STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best beside the embedding bank
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
 # These do best in those numbers of steps. Noise that is added between steps brings touches' variety back.
@@ -32,9 +36,13 @@ SCHEDULERS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 PLACES = {
-    "audio": "joint", "image_vae": "image-vae", "unclip": "touch-to-image", "touch_vae": "touch-vae",
-    "touch_ldm": "x-to-touch", "touch_llm": "touch-to-text",
-}  # fmt: skip
+    "audio": "joint",
+    "image_vae": "image-vae",
+    "unclip": "touch-to-image",
+    "touch_vae": "touch-vae",
+    "touch_ldm": "x-to-touch",
+    "touch_llm": "touch-to-text",
+}
 """Folders of a family, by the stages whose models they hold."""
 
 

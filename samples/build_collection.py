@@ -25,7 +25,8 @@ from tqdm import tqdm
 
 from unitouch_gen.world.scans import COLLECTION, COLOURS, HEIGHT_RANGE, HEIGHTS
 
-COLOUR_SIDE, HEIGHT_SIDE = 256, 384  # pixels
+COLOUR_SIDE = 256  # pixels
+HEIGHT_SIDE = 384  # pixels
 KEPT_CORRELATION = 0.99  # between a height map and its compressed file
 LEFT_OUT = ("3dtextures",)  # sources whose licence is stated by their site alone
 FINE_STEPS = 0.2  # share of its range that an 8-bit height map has to use; below it, steps would be felt
@@ -150,7 +151,8 @@ def integrated(normals: np.ndarray) -> np.ndarray:
     slope_y = normals[..., 1] / normals[..., 2].clip(0.2)
     wave_y = 2j * np.pi * np.fft.fftfreq(slope_x.shape[0])[:, None]
     wave_x = 2j * np.pi * np.fft.fftfreq(slope_x.shape[1])[None, :]
-    along_x, along_y = np.fft.fft2(slope_x), np.fft.fft2(slope_y)
+    along_x = np.fft.fft2(slope_x)
+    along_y = np.fft.fft2(slope_y)
     curls = [np.abs(wave_x * sign * along_y - wave_y * along_x).sum() for sign in (1.0, -1.0)]
     sign = (1.0, -1.0)[int(np.argmin(curls))]
     power = np.abs(wave_x) ** 2 + np.abs(wave_y) ** 2
@@ -250,7 +252,8 @@ def compressed_height(relief: np.ndarray) -> bytes:
 
 def write_surfaces(surfaces: list[Surface], place: Path) -> list[dict[str, str]]:
     place.mkdir(parents=True, exist_ok=True)
-    splits, rows = splits_of(surfaces), []
+    splits = splits_of(surfaces)
+    rows = []
     for surface in tqdm(surfaces, "surfaces"):
         name = f"{surface.material.replace(' ', '_')}__{surface.provider.split('/')[0].lower()}_{surface.name}"
         name = re.sub(r"[^a-z0-9_]+", "_", name.lower())

@@ -15,8 +15,10 @@ from unitouch_gen.world.draws import SHAPES
 
 Tile = Image.Image | Tensor | None
 
-GAP, MARGIN = 6, 12
-INK, PAPER = "black", "white"
+GAP = 6
+MARGIN = 12
+INK = "black"
+PAPER = "white"
 
 
 def to_tile(picture: Image.Image | Tensor, side: int) -> Image.Image:
@@ -67,12 +69,14 @@ def draw_grid(
         size: Of the text, pixels.
         blocks: Rows are divided among so many blocks side by side, which keeps a long grid short enough for a page.
     """
-    columns, height = len(titles), -(-len(rows) // blocks)
+    columns = len(titles)
+    height = -(-len(rows) // blocks)
     upwards = [written(label, size, side).rotate(90, expand=True) for label in labels]
     above = [written(title, size, side) for title in titles]
     left = max(label.width for label in upwards) + 2 * GAP
     top = max(title.height for title in above) + 2 * GAP
-    pitch, block = side + GAP, left + columns * (side + GAP) + MARGIN
+    pitch = side + GAP
+    block = left + columns * (side + GAP) + MARGIN
     canvas = Image.new("RGB", (MARGIN + blocks * block - GAP, MARGIN + top + height * pitch - GAP + MARGIN), PAPER)
     for number, (row, label) in enumerate(zip(rows, upwards, strict=True)):
         x = MARGIN + number // height * block
@@ -100,7 +104,8 @@ def flat_contacts(world: World, number: int = 0) -> tuple[list[int], list[int], 
 
     Of a world of drawn and scanned objects, every second material is scanned, as far as there are scans.
     """
-    first, chosen = FIRST_OBJECT["test"], []
+    first = FIRST_OBJECT["test"]
+    chosen = []
     objects = torch.arange(first, first + 40 + 20 * number)
     for material in range(len(MATERIAL_NAMES)):
         draws = world.draw(torch.full_like(objects, material), objects, torch.zeros_like(objects))

@@ -25,10 +25,12 @@ def main() -> None:
     pipe = unitouch_gen.tiny("x-to-touch")
     sensors = pipe.config.sensors
     figure, axes = plt.subplots(
-        len(arguments.sounds), 1 + len(sensors), squeeze=False,
+        len(arguments.sounds),
+        1 + len(sensors),
+        squeeze=False,
         figsize=(3.2 + 1.4 * len(sensors), 1.45 * len(arguments.sounds)),
         width_ratios=[2.2] + [1] * len(sensors),
-    )  # fmt: skip
+    )
     for row, file in enumerate(arguments.sounds):
         samples, rate = soundfile.read(file, always_2d=True)
         axes[row, 0].plot([1000 * i / rate for i in range(len(samples))], samples.mean(axis=1), linewidth=0.6)

@@ -48,7 +48,8 @@ def main() -> None:
 
 def frame_of(picture: Image.Image, ends: list[tuple[Image.Image, str]], share: float, side: int) -> Image.Image:
     """The picture between the two touches with their names, each as faint as its share in it is small."""
-    small, bar = side // 2, MARGIN
+    small = side // 2
+    bar = MARGIN
     names = [written(name, 18, small) for _, name in ends]
     canvas = Image.new("RGB", (2 * (MARGIN + small + GAP) + side, MARGIN + side + bar + MARGIN), PAPER)
     canvas.paste(picture.resize((side, side), Image.Resampling.BICUBIC), (MARGIN + small + GAP, MARGIN))
@@ -60,7 +61,9 @@ def frame_of(picture: Image.Image, ends: list[tuple[Image.Image, str]], share: f
         faint = Image.blend(Image.new("RGB", shown.size, PAPER), shown, 0.25 + 0.75 * weight)
         canvas.paste(faint, (x, MARGIN + (side - small) // 2))
     # Where between the two the picture is.
-    draw, left, y = ImageDraw.Draw(canvas), MARGIN + small + GAP, MARGIN + side + bar
+    draw = ImageDraw.Draw(canvas)
+    left = MARGIN + small + GAP
+    y = MARGIN + side + bar
     draw.line((left, y, left + side, y), "lightgrey", 2)
     draw.circle((left + share * side, y), 5, INK)
     # A palette for each frame, and no dithering: its grain would flicker.

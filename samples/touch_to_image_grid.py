@@ -22,7 +22,8 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=4, help="pictures generated from each touch")
     arguments = parser.parse_args()
 
-    world, count = World(scanned=0.5), len(MATERIAL_NAMES)
+    world = World(scanned=0.5)
+    count = len(MATERIAL_NAMES)
     names = flat_contacts(world, arguments.object)
     scene = world.render(*names, modalities=("image", "touch"), sensors=(arguments.sensor,))
     touches = scene.touch[arguments.sensor]

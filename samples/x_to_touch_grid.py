@@ -26,7 +26,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
-    world, count = World(scanned=0.5), len(MATERIAL_NAMES)
+    world = World(scanned=0.5)
+    count = len(MATERIAL_NAMES)
     names = flat_contacts(world, arguments.object)
     scene = world.render(*names, modalities=("image", "touch", "audio", "text"), sensors=(arguments.sensor,))
     pipe = unitouch_gen.tiny("x-to-touch")

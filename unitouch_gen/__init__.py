@@ -35,11 +35,24 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "InvalidInputError", "InvalidTypeError", "LanguageBridge", "NonFiniteError", "SensorBank",
-    "StemmedCLIPVisionModel", "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline",
-    "TouchToTextPipelineOutput", "UniTouchConfig", "UniTouchModel", "UniTouchPipelineOutput", "UniTouchProcessor",
-    "XToTouchPipeline", "example", "tiny",
-]  # fmt: skip
+    "InvalidInputError",
+    "InvalidTypeError",
+    "LanguageBridge",
+    "NonFiniteError",
+    "SensorBank",
+    "StemmedCLIPVisionModel",
+    "TactileStylizationPipeline",
+    "TouchToImagePipeline",
+    "TouchToTextPipeline",
+    "TouchToTextPipelineOutput",
+    "UniTouchConfig",
+    "UniTouchModel",
+    "UniTouchPipelineOutput",
+    "UniTouchProcessor",
+    "XToTouchPipeline",
+    "example",
+    "tiny",
+]
 
 # Pictures are prepared with Pillow, so transformers need not tell everyone that torchvision is missing.
 logging.getLogger("transformers.utils.import_utils").addFilter(

@@ -132,7 +132,8 @@ def _read_published(
 
 def _encoder_in(subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str) -> dict[str, Tensor]:
     """The tensors of a modality in a published file of tensors `keys`, by our keys; `subject` begins messages."""
-    found, prefix = {}, MODULES[modality][0]
+    found = {}
+    prefix = MODULES[modality][0]
     with torch.device("meta"):
         encoder = make_modules(config, modality)[prefix]
     for key in encoder.state_dict():

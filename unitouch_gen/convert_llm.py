@@ -20,10 +20,16 @@ from unitouch_gen.models.processing import read_tokenizer
 
 OUTER = {"model.embed_tokens": "tok_embeddings", "model.norm": "norm", "lm_head": "output"}
 INNER = {
-    "input_layernorm": "attention_norm", "post_attention_layernorm": "ffn_norm", "self_attn.q_proj": "attention.wq",
-    "self_attn.k_proj": "attention.wk", "self_attn.v_proj": "attention.wv", "self_attn.o_proj": "attention.wo",
-    "mlp.gate_proj": "feed_forward.w1", "mlp.down_proj": "feed_forward.w2", "mlp.up_proj": "feed_forward.w3",
-}  # fmt: skip
+    "input_layernorm": "attention_norm",
+    "post_attention_layernorm": "ffn_norm",
+    "self_attn.q_proj": "attention.wq",
+    "self_attn.k_proj": "attention.wk",
+    "self_attn.v_proj": "attention.wv",
+    "self_attn.o_proj": "attention.wo",
+    "mlp.gate_proj": "feed_forward.w1",
+    "mlp.down_proj": "feed_forward.w2",
+    "mlp.up_proj": "feed_forward.w3",
+}
 """Modules of transformers' LLaMA, and of each of its layers, as the published files call them."""
 
 PROMPT = (
@@ -85,12 +91,20 @@ def bridge_of(tensors: dict[str, Tensor], layers: int) -> LanguageBridge:
     rank = len(tensors.get(f"{attention[0]}.lora_wv_l1.weight", ()))
     for name, end in {"value_down": "l1", "value_up": "l2"}.items() if rank else ():
         state[name] = torch.stack([tensors[f"{place}.lora_wv_{end}.weight"] for place in attention])
-    (width, dim), (hidden, _) = state["projection.weight"].shape, state["blocks.0.w1.weight"].shape
-    blocks, legacy = sum(key.endswith("w1.weight") for key in state), "blocks.0.w1.bias" in state
+    width, dim = state["projection.weight"].shape
+    hidden, _ = state["blocks.0.w1.weight"].shape
+    blocks = sum(key.endswith("w1.weight") for key in state)
+    legacy = "blocks.0.w1.bias" in state
     made = LanguageBridge(
-        dim, width, layers, state["gates"].shape[1], num_blocks=blocks, intermediate_size=hidden, legacy=legacy,
+        dim,
+        width,
+        layers,
+        state["gates"].shape[1],
+        num_blocks=blocks,
+        intermediate_size=hidden,
+        legacy=legacy,
         value_rank=rank,
-    )  # fmt: skip
+    )
     made.load_state_dict(state)
     return made
 
@@ -103,7 +117,8 @@ def lay_over(model: Any, tensors: dict[str, Tensor]) -> None:
     for ours, theirs in names.items():
         module: Any = model.get_submodule(ours)
         rows: Any
-        rows, (place, _, name) = slice(None), theirs.rpartition(".")
+        rows = slice(None)
+        place, _, name = theirs.rpartition(".")
         if ours.endswith(("q_proj", "k_proj")):  # both rows of a rotary pair, then half a head apart
             order = torch.arange(len(module.weight))
             rows = order.view(-1, model.config.head_dim // 2, 2).transpose(1, 2).flatten()

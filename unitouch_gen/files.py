@@ -287,9 +287,11 @@ def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str
         raise InvalidInputError(f"{str(file)!r} is no table: {error}, in line {lines.line_num}.") from error
     names = header or [name.lower() for name in (cells.pop(0) if cells else ())]
     if not header and len(names) > 1 and not names[0]:  # the row numbers of pandas
-        names, cells = names[1:], [row[1:] for row in cells]
+        names = names[1:]
+        cells = [row[1:] for row in cells]
     width = max((place for row in (names, *cells) for place, cell in enumerate(row, start=1) if cell), default=0)
-    names, cells = names[:width], [row[:width] for row in cells]
+    names = names[:width]
+    cells = [row[:width] for row in cells]
     odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
     if not cells or odd or len(set(names)) < len(names):
         wrong = f"other columns in row {', '.join(odd[:5])}; quote texts that hold commas" if odd else "two of one name"
@@ -343,7 +345,8 @@ def check_filled(folder: Path, network: Any) -> None:
     tensors = [*network.state_dict().values()]
     lacking = [one for one in tensors if one.is_meta]
     # Tied weights are stored once.
-    held, wanted = sum(sizes.values()), sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
+    held = sum(sizes.values())
+    wanted = sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
     if lacking or held < wanted:
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "

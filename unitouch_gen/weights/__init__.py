@@ -12,9 +12,12 @@ in fp16.
 from pathlib import Path
 
 FAMILY = Path(__file__).parent
-JOINT, EMBEDDING_BANK = FAMILY / "joint", FAMILY / "embedding-bank"
-IMAGE_VAE, TOUCH_VAE = FAMILY / "image-vae", FAMILY / "touch-vae"
+JOINT = FAMILY / "joint"
+EMBEDDING_BANK = FAMILY / "embedding-bank"
+IMAGE_VAE = FAMILY / "image-vae"
+TOUCH_VAE = FAMILY / "touch-vae"
 TOUCH_TO_IMAGE, X_TO_TOUCH, TOUCH_TO_TEXT = (FAMILY / of for of in ("touch-to-image", "x-to-touch", "touch-to-text"))
-PICTURE_CLASSIFIER, TOUCH_CLASSIFIER = FAMILY / "picture-classifier", FAMILY / "touch-classifier"
+PICTURE_CLASSIFIER = FAMILY / "picture-classifier"
+TOUCH_CLASSIFIER = FAMILY / "touch-classifier"
 FIGURES = FAMILY / "family.json"
 CARDS = FAMILY / "cards"
