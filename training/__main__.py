@@ -13,30 +13,30 @@ from unitouch_gen.training.stages import FOLDERS, Recipe, Stage, folders_of, run
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
 
 
-def add(name: str, sentence: str) -> None:
-    """Adds the command of a stage."""
+def add_command(name: str, description: str) -> None:
+    """Adds the command of a stage, with the options that this stage takes."""
 
     def command(**options: Any) -> None:
         run_stage(name, **options)
 
-    options = signature(partial(Stage, name, Recipe))
-    unused = {*FOLDERS} - folders_of(name)
-    taken = [parameter for option, parameter in options.parameters.items() if option not in unused]
-    command.__signature__ = options.replace(parameters=taken)  # type: ignore[attr-defined]
-    app.command(name, help=sentence)(command)
+    all_options = signature(partial(Stage, name, Recipe))
+    other_folders = {*FOLDERS} - folders_of(name)
+    parameters = [parameter for option, parameter in all_options.parameters.items() if option not in other_folders]
+    command.__signature__ = all_options.replace(parameters=parameters)  # type: ignore[attr-defined]
+    app.command(name, help=description)(command)
 
 
-add("image_text", "Binds pictures and captions to each other: the joint space.")
-add("touch", "Binds touches to pictures.")
-add("texture", "Adds to pictures and touches what a network trained on photos says of their texture.")
-add("audio", "Binds sounds to pictures.")
-add("image_vae", "Learns the autoencoder of pictures.")
-add("unclip", "Learns to draw pictures from embeddings of pictures.")
-add("touch_vae", "Learns the autoencoder of touches.")
-add("touch_ldm", "Learns to draw touches from embeddings of pictures.")
-add("language_model", "Learns a small language model of questions about contacts.")
-add("touch_llm", "Learns a bridge from embeddings of pictures into a language model.")
-add("distill", "Learns LoRA weights by which a saved pipeline draws in four evaluations.")
+add_command("image_text", "Trains the joint space: image and text encoders.")
+add_command("touch", "Trains the touch encoder on frozen image embeddings.")
+add_command("texture", "Adds texture heads, on a network trained on photos, to the image and touch encoders.")
+add_command("audio", "Trains the audio encoder on frozen image embeddings.")
+add_command("image_vae", "Trains the autoencoder of pictures.")
+add_command("unclip", "Trains the diffusion of pictures from image embeddings.")
+add_command("touch_vae", "Trains the autoencoder of touches.")
+add_command("touch_ldm", "Trains the diffusion of touches from image embeddings.")
+add_command("language_model", "Trains a small language model on questions about contacts.")
+add_command("touch_llm", "Trains a bridge from image embeddings into a language model.")
+add_command("distill", "Trains LoRA weights with which a saved pipeline draws in four evaluations.")
 
 if __name__ == "__main__":
     sys.exit(run_commands(app, "unitouch_gen.training", prog_name="python -m unitouch_gen.training"))

@@ -1,4 +1,4 @@
-"""Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023)."""
+"""Audio bound to frozen images, as ImageBind (Girdhar et al., 2023)."""
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,7 @@ from unitouch_gen.training.stages import Recipe, Stage
 
 
 class AudioObjective(nn.Module):
-    """Symmetric InfoNCE between sounds and the frozen embeddings of the pictures they belong to."""
+    """Symmetric InfoNCE between sounds and the frozen embeddings of their pictures."""
 
     def __init__(self, model: UniTouchModel):
         super().__init__()
@@ -20,14 +20,16 @@ class AudioObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         spectrum = roll_in_time(batch["audio"].float(), 2)
         spectrum = spectrum + 0.02 * torch.randn_like(spectrum)
-        return {"loss": symmetric_info_nce(self.trained(spectrum), batch["image_embeds"], self.temperature)}
+        audio_embeds = self.trained(spectrum)
+        return {"loss": symmetric_info_nce(audio_embeds, batch["image_embeds"], self.temperature)}
 
 
 def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
-    """Delays each log-mel picture (B, 1, mel, T) by up to `reach` frames."""
+    """Delays each log-mel spectrogram (B, 1, mel, T) by up to `reach` frames; the first frame is repeated."""
     delays = torch.randint(0, reach + 1, (len(spectrum),))
-    frames = (torch.arange(spectrum.shape[-1])[None, :] - delays[:, None]).clamp_min(0)
-    return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
+    frames = torch.arange(spectrum.shape[-1])
+    sources = (frames[None, :] - delays[:, None]).clamp_min(0)  # (B, T)
+    return spectrum.gather(3, sources[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
 def main(stage: Stage, recipe: Recipe) -> None:

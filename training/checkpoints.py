@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: which are whole, the one to resume from, and removing older ones.
+"""Checkpoints of a training run: which are complete, which to resume from, and removing older ones.
 
 runs/touch/checkpoints/step-00000250/     what accelerate's `save_state` wrote
                                           progress.json, written last: without it a checkpoint is unfinished
@@ -27,7 +27,7 @@ CHECKPOINT_FILE = re.compile(
 
 
 def checkpoint_folders(output: Path) -> list[Path]:
-    """Folders of finished and unfinished checkpoints, the last one last; copies under other names are left out."""
+    """Folders of finished and unfinished checkpoints, by step. Copies under other names are left out."""
     folders = (output / "checkpoints").glob("step-*")
     return sorted(folder for folder in folders if re.fullmatch(r"step-\d{8}", folder.name))
 
@@ -38,12 +38,12 @@ def files_of_checkpoint(folder: Path) -> list[Path]:
 
 
 def checkpoints_in(output: Path) -> list[Path]:
-    """The finished checkpoints of a run, the last one last."""
+    """The finished checkpoints of a run, by step."""
     return [folder for folder in checkpoint_folders(output) if (folder / "progress.json").is_file()]
 
 
 def last_checkpoint(output: Path) -> Path:
-    """The last checkpoint of a run whose files are whole.
+    """The last checkpoint of a run whose files are undamaged.
 
     Raises:
         InvalidInputError: If there is none.
@@ -51,51 +51,55 @@ def last_checkpoint(output: Path) -> Path:
     Warns:
         UserWarning: If a later one is damaged.
     """
-    later_damage: Path | None = None
+    damaged: Path | None = None  # a damaged file of the latest checkpoint that has one
     for folder in reversed(checkpoints_in(output)):
-        damaged = _damaged_file(folder)
-        if damaged is None:
-            if later_damage is not None:
-                message = f"{str(later_damage)!r} is missing or damaged; the run goes on from {folder.name}, before it."
+        damaged_here = _damaged_file(folder)
+        if damaged_here is None:
+            if damaged is not None:
+                message = f"{str(damaged)!r} is missing or damaged; the run goes on from {folder.name}, before it."
                 warnings.warn(message, stacklevel=2)
             return folder
-        later_damage = later_damage or damaged
-    if later_damage is not None:
+        damaged = damaged or damaged_here
+    if damaged is not None:
         raise InvalidInputError(
-            f"`resume` finds {str(later_damage)!r} missing or damaged, and no whole checkpoint before it; begin anew "
+            f"`resume` finds {str(damaged)!r} missing or damaged, and no whole checkpoint before it; begin anew "
             "in another `output`."
         )
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
 
 
 def read_progress(output: Path) -> dict[str, Any]:
-    """The progress of a run's last whole checkpoint: `step`, `seconds`, and what `Trainer` was passed as `progress`."""
+    """The progress of a run's last undamaged checkpoint: `step`, `seconds`, and the `progress` given to `Trainer`."""
     return read_settings("resume", last_checkpoint(output) / "progress.json")
 
 
 def _damaged_file(checkpoint: Path) -> Path | None:
-    """The first file of a checkpoint that is missing, cut off or, if it is a zip, fails its checksum; else `None`."""
+    """The first file of a checkpoint that is missing or damaged; else `None`."""
     try:
         progress = json.loads((checkpoint / "progress.json").read_text())
-        # Those of earlier versions list no files.
+        # Checkpoints of earlier versions list no files.
         names = progress.get("files") or [file.name for file in files_of_checkpoint(checkpoint)]
         files = [checkpoint / Path(name).name for name in names]
     except (ValueError, TypeError, AttributeError):
         return checkpoint / "progress.json"
     for file in files:
-        if not os.path.isfile(file):
-            return file
-        try:
-            if file.suffix == ".safetensors":
-                with safe_open(file, framework="pt"):  # compares the length with what the header says
-                    pass
-            elif file.suffix in (".bin", ".pkl", ".pt"):
-                with zipfile.ZipFile(file) as archive:
-                    if archive.testzip() is not None:
-                        return file
-        except (OSError, SafetensorError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError):
+        if not os.path.isfile(file) or _is_damaged(file):
             return file
     return None
+
+
+def _is_damaged(file: Path) -> bool:
+    """Whether a safetensors file is cut off, or a zip (what `torch.save` writes) fails its checksums."""
+    try:
+        if file.suffix == ".safetensors":
+            with safe_open(file, framework="pt"):  # compares the file's length with its header
+                return False
+        if file.suffix in (".bin", ".pkl", ".pt"):
+            with zipfile.ZipFile(file) as archive:
+                return archive.testzip() is not None
+    except (OSError, SafetensorError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError):
+        return True
+    return False
 
 
 def remove_checkpoint(folder: Path) -> None:
@@ -103,7 +107,7 @@ def remove_checkpoint(folder: Path) -> None:
     (folder / "progress.json").unlink(missing_ok=True)
     for file in files_of_checkpoint(folder):
         file.unlink()
-    with suppress(OSError):  # of a folder that holds files of others
+    with suppress(OSError):  # the folder may hold other files
         folder.rmdir()
 
 
