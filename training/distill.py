@@ -1,14 +1,15 @@
 """A pipeline in four evaluations: distribution matching distillation (Yin et al., 2024, "DMD2") of LoRA layers.
 
 The student is the network with LoRA layers. It draws as diffusers' `LCMScheduler` does, and learns to draw what guided
-sampling draws: noised, its latents are shown to the network and to a critic, which are other LoRA layers that learn to
-denoise what the student draws, and moved where the network's guided prediction differs from the critic's. The result is
-a LoRA file. Pipelines use it with that scheduler, the same timesteps, and a `guidance_scale` of 1, since guidance is
-learnt; `defaults.json` beside it says so.
+sampling draws. The critic is the network with other LoRA layers, which learn to denoise what the student draws. The
+student's latents are noised and denoised by both, and move along the difference of the network's guided prediction and
+the critic's. The result is a LoRA file. Pipelines use it with that scheduler, the same timesteps, and a
+`guidance_scale` of 1, since guidance is learnt. `defaults.json` beside it holds these settings.
 """
 
 import json
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,11 +41,13 @@ Conditioned = unclip.UnclipObjective | touch_ldm.TouchDiffusionObjective
 
 
 class DistillSettings(Settings):
-    """How the student is taught."""
+    """Settings of the distillation."""
 
-    timesteps: Annotated[list[NonNegativeInt], Field(min_length=1)]  # at which the student draws, falling
-    margin: Annotated[float, Field(ge=0.0, lt=0.5)]  # share of the timesteps at either end that nothing is noised to
-    critic_rank: PositiveInt  # of the critic's LoRA layers, which are not kept
+    timesteps: Annotated[list[NonNegativeInt], Field(min_length=1)]  # of the student's steps, descending
+    margin: Annotated[
+        float, Field(ge=0.0, lt=0.5)
+    ]  # share of the timesteps at either end that are not used for noising
+    critic_rank: PositiveInt  # rank of the critic's LoRA layers, which are not kept
 
 
 class DistillRecipe(Recipe):
@@ -55,8 +58,8 @@ class DistillRecipe(Recipe):
 class DistillObjective(nn.Module):
     """The student's loss, whose gradient is Equation 3 of DMD (Yin et al., 2024), and the critic's.
 
-    One network is all three: without LoRA layers the teacher, with those of `STUDENT` the student, with those of
-    `CRITIC` the critic. `conditioned` is the objective that trained the network; it makes the conditions.
+    One network plays all three parts: without LoRA layers it is the teacher, with those of `STUDENT` the student, with
+    those of `CRITIC` the critic. `conditioned` is the objective that trained the network; it makes the conditions.
     """
 
     def __init__(
@@ -82,51 +85,51 @@ class DistillObjective(nn.Module):
         self.timesteps = settings.timesteps
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        shape = batch["latents"].shape
-        device = batch["latents"].device
-        every = torch.ones(len(batch["latents"]), dtype=torch.bool, device=device)
-        conditions = self.frozen[0].conditions(batch, every)
-        unconditional = self.frozen[0].conditions(batch, ~every)
-        drawn = self.drawn(torch.randn(shape, device=device), conditions)
-        aim = self.moved(drawn.detach(), conditions, unconditional)
-        self._take(CRITIC)
+        latents = batch["latents"]
+        kept = torch.ones(len(latents), dtype=torch.bool, device=latents.device)
+        conditions = self.frozen[0].conditions(batch, kept)
+        unconditional = self.frozen[0].conditions(batch, ~kept)
+        drawn = self.drawn(torch.randn(latents.shape, device=latents.device), conditions)
+        target = self.moved(drawn.detach(), conditions, unconditional)
+        self._use_layers(CRITIC)
         critic = denoising_loss(self.trained, self.scheduler, drawn.detach(), step_power=1.0, **conditions)
-        student = 0.5 * (drawn - aim).square().mean()
+        student = 0.5 * (drawn - target).square().mean()
         return {"loss": student + critic, "student": student.detach(), "critic": critic.detach()}
 
     def drawn(self, z: Tensor, conditions: dict[str, Tensor]) -> Tensor:
         """Latents (B, C, h, w) that the student predicts in one of its steps, from noise (B, C, h, w)."""
-        self._take(STUDENT)
+        self._use_layers(STUDENT)
         last = int(torch.randint(len(self.timesteps), ()))
+        timesteps = [torch.full((len(z),), timestep, device=z.device) for timestep in self.timesteps[: last + 1]]
         with torch.no_grad():
-            for timestep, following in zip(self.timesteps[:last], self.timesteps[1:], strict=False):
-                denoised = self._denoised(z, torch.full((len(z),), timestep, device=z.device), conditions)
-                z = self._noised(denoised, torch.full((len(z),), following, device=z.device))
-        return self._denoised(z, torch.full((len(z),), self.timesteps[last], device=z.device), conditions)
+            for t, next_t in pairwise(timesteps):
+                z = self._noised(self._denoised(z, t, conditions), next_t)
+        return self._denoised(z, timesteps[-1], conditions)
 
     @torch.no_grad()
     def moved(self, drawn: Tensor, conditions: dict[str, Tensor], unconditional: dict[str, Tensor]) -> Tensor:
-        """Drawn latents (B, C, h, w), moved to where the guided teacher expects them rather than the critic."""
-        margin = self.settings.margin
+        """Drawn latents (B, C, h, w), moved from the critic's prediction towards the guided teacher's."""
         count = self.scheduler.config.num_train_timesteps
-        t = torch.randint(round(margin * count), count - round(margin * count), (len(drawn),), device=drawn.device)
+        margin = round(self.settings.margin * count)
+        t = torch.randint(margin, count - margin, (len(drawn),), device=drawn.device)
         z = self._noised(drawn, t)
-        self._take(CRITIC)
-        known = self._denoised(z, t, conditions)
+        self._use_layers(CRITIC)
+        fake = self._denoised(z, t, conditions)
         self.trained.disable_adapters()
-        without, given = (self._denoised(z, t, one) for one in (unconditional, conditions))
+        without_condition = self._denoised(z, t, unconditional)
+        with_condition = self._denoised(z, t, conditions)
         self.trained.enable_adapters()
-        real = without + self.guidance_scale * (given - without)
+        real = without_condition + self.guidance_scale * (with_condition - without_condition)
         size = (drawn - real).abs().mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-3)
-        return drawn + (real - known) / size
+        return drawn + (real - fake) / size
 
-    def _take(self, layers: str) -> None:
-        """Computes with the student's layers or the critic's; both stay trained."""
-        self.trained.set_adapter(layers)
+    def _use_layers(self, name: str) -> None:
+        """Activates the student's layers or the critic's; both keep their gradients."""
+        self.trained.set_adapter(name)
         train_layers(self.trained)
 
     def _denoised(self, z: Tensor, t: Tensor, conditions: dict[str, Tensor]) -> Tensor:
-        """What the network predicts of the data, (B, C, h, w)."""
+        """The network's prediction of clean latents, (B, C, h, w)."""
         prediction = predict(self.trained, z, t, **conditions)
         sigma = self.schedule.sigma(t.cpu()).float().to(t.device)[:, None, None, None]
         return to_denoised(prediction, z, sigma, self.scheduler.config.prediction_type)
@@ -137,35 +140,38 @@ class DistillObjective(nn.Module):
 
 
 def train_layers(unet: UNet2DConditionModel) -> None:
-    """Asks for gradients of all LoRA layers, since peft asks for those of the last ones taken alone."""
+    """Asks for gradients of all LoRA layers; peft's `set_adapter` asks only for those of the active ones."""
     for name, parameter in unet.named_parameters():
         if "lora_" in name:
             parameter.requires_grad_(True)
 
 
 def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, init: Path | None = None) -> None:
-    """Adds the LoRA layers of student and critic to a network; only these are trained.
+    """Adds the LoRA layers of student and critic to a network. Only these are trained.
 
-    The student's begin as those stored in the folder `init`, if there is one.
+    With a folder `init`, the student's layers are read from there.
     """
-    ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's own
-    kind = needed("peft").LoraConfig
-    configs = {name: build("lora", kind, {**lora, "r": rank}, lora_alpha=rank) for name, rank in ranks.items()}
+    ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's default
+    lora_config = needed("peft").LoraConfig
+    configs = {name: build("lora", lora_config, {**lora, "r": rank}, lora_alpha=rank) for name, rank in ranks.items()}
     unet.requires_grad_(False)
     if init is not None:
         with reading("init", init):
             unet.load_lora_adapter(init, prefix="unet", adapter_name=STUDENT, use_safetensors=True)
-        held = getattr(unet, "peft_config", {}).get(STUDENT)
-        if held is None or held.r != ranks[STUDENT]:
-            holds = "no LoRA weights of a UNet" if held is None else f"layers of rank {held.r}; set `lora.r` to that"
-            raise InvalidInputError(f"`init` is {str(init)!r}, which holds {holds}.")
+        stored = getattr(unet, "peft_config", {}).get(STUDENT)
+        if stored is None:
+            raise InvalidInputError(f"`init` is {str(init)!r}, which holds no LoRA weights of a UNet.")
+        if stored.r != ranks[STUDENT]:
+            raise InvalidInputError(
+                f"`init` is {str(init)!r}, which holds layers of rank {stored.r}; set `lora.r` to that."
+            )
         del configs[STUDENT]
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # of a second set of layers
+        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # raised for a second set of layers
         try:
             for name, config in configs.items():
                 unet.add_adapter(config, name)
-        except ValueError as error:  # no such modules
+        except ValueError as error:  # the network has no such modules
             raise InvalidInputError(f"`lora` does not fit the network: {error}") from error
     train_layers(unet)
 
@@ -173,7 +179,7 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, in
 def conditioned_touches(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
-    """The objective that trains a network of touches, and its data."""
+    """The objective that trained a network of touches, and its data."""
     sensors = settings["sensors"]
     with_gels = unet.config.in_channels != unet.config.out_channels
     if with_gels and stage.data.drawn is None:
@@ -182,14 +188,17 @@ def conditioned_touches(
         if sensors and (source.sensor is not None or not with_gels):
             check_choice("data: sensor", source.sensor, sensors)
     dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
-    how = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
-    return touch_ldm.TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, how, gels), dataset
+    objective_settings = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
+    objective = touch_ldm.TouchDiffusionObjective(
+        unet, scheduler, joint.config.embedding_norm, settings=objective_settings, backgrounds=gels
+    )
+    return objective, dataset
 
 
 def conditioned_pictures(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
-    """The objective that trains a network of pictures, and its data."""
+    """The objective that trained a network of pictures, and its data."""
     folder = stage.folders["model"]
     processor = stage.processor
     with reading("model", folder):
@@ -198,9 +207,19 @@ def conditioned_pictures(
         text_encoder = read_network(CLIPTextModel, folder / "text_encoder")
         processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
     dataset, captions = unclip.inputs(stage, joint, vae)
-    how = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
-    parts = (read(unclip.UnclipSettings, how), normalizer, noising, captions, processor, text_encoder)
-    return unclip.UnclipObjective(unet, scheduler, *parts, settings["default_noise_level"]), dataset
+    section = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
+    objective = unclip.UnclipObjective(
+        unet,
+        scheduler,
+        settings=read(unclip.UnclipSettings, section),
+        normalizer=normalizer,
+        noising=noising,
+        captions=captions,
+        processor=processor,
+        text_encoder=text_encoder,
+        level=settings["default_noise_level"],
+    )
+    return objective, dataset
 
 
 CONDITIONED = {
@@ -224,9 +243,13 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
     layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=STUDENT)
-    with stage.saving() as place:
-        halves = {name: tensor.half() for name, tensor in layers.items()}
-        StableDiffusionLoraLoaderMixin.save_lora_weights(place, unet_lora_layers=halves)
-        steps = recipe.objective.timesteps
-        drawn = {"default_num_inference_steps": len(steps), "default_timesteps": steps, "default_guidance_scale": 1.0}
-        (place / "defaults.json").write_text(json.dumps(drawn, indent=2) + "\n")
+    with stage.saving() as output:
+        half_precision = {name: tensor.half() for name, tensor in layers.items()}
+        StableDiffusionLoraLoaderMixin.save_lora_weights(output, unet_lora_layers=half_precision)
+        timesteps = recipe.objective.timesteps
+        defaults = {
+            "default_num_inference_steps": len(timesteps),
+            "default_timesteps": timesteps,
+            "default_guidance_scale": 1.0,
+        }
+        (output / "defaults.json").write_text(json.dumps(defaults, indent=2) + "\n")

@@ -1,13 +1,14 @@
-"""Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
+"""The joint space of image and text, trained as CLIP (Radford et al., 2021).
 
 Pictures of a drawn contact under two lamps can be bound to each other, as SimCLR binds views of an image (Chen et al.,
 2020). Captions do not say which contact a picture shows, and touches are bound to single pictures later.
 
-`--init` continues training from the encoders, tokenizer and sizes of a joint space, in place of the recipe's and of
-the built-in tokenizer, which knows the world's words and every byte.
+Training starts from random encoders of the recipe's sizes and the built-in tokenizer, which knows the world's words and
+every byte. With `--init` it continues from the encoders, tokenizer and sizes of a joint space.
 """
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
+from transformers import PreTrainedTokenizerBase
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
@@ -33,23 +35,23 @@ SHOWN = tuple(name for name in ATTRIBUTES if name not in ("depth", "load"))
 
 
 class ImageTextSettings(Settings):
-    """What drawn contacts add to CLIP."""
+    """Losses and captions that drawn contacts add to CLIP."""
 
     attributes: NonNegativeFloat = 0.0  # weight of the squared error of attributes, in units of their deviations
-    captions: PositiveInt = 1  # of each drawn contact, one of which is drawn at every step
+    captions: PositiveInt = 1  # number for each drawn contact; every step draws one of them
     views: NonNegativeFloat = 0.0  # weight of InfoNCE between pictures of a contact under two lamps
 
 
 class ImageTextRecipe(Recipe):
     model: Arguments
     objective: ImageTextSettings = ImageTextSettings()
-    sampler: SamplerSettings = SamplerSettings()  # alike to the weights that training starts from
+    sampler: SamplerSettings = SamplerSettings()  # groups are by the embeddings at the start
 
 
 class ImageTextObjective(nn.Module):
-    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it.
+    """Symmetric InfoNCE between pictures and captions with a learned temperature, and losses of drawn contacts.
 
-    The squared error of attributes (B, K), in deviations, is of what is read linearly off a picture's embedding.
+    Attributes (B, K), in deviations, are predicted linearly from a picture's embedding.
     """
 
     def __init__(self, model: UniTouchModel, settings: ImageTextSettings):
@@ -65,11 +67,13 @@ class ImageTextObjective(nn.Module):
         image = self.model.get_image_features(normalise_pixels(raw))
         captions = batch["input_ids"]  # (B, captions, L)
         rows = torch.arange(len(captions))
-        text = self.model.get_text_features(captions[rows, torch.randint(captions.shape[1], (len(captions),))])
+        chosen = torch.randint(captions.shape[1], (len(captions),))
+        text = self.model.get_text_features(captions[rows, chosen])
         temperature = 1.0 / self.log_scale.exp().clamp(max=100.0)
         parts = {"text": symmetric_info_nce(image, text, temperature)}
         if self.settings.views:
-            second = self.model.get_image_features(normalise_pixels(recoloured(batch["relit"].float() / 255)))
+            relit_pixels = recoloured(batch["relit"].float() / 255)
+            second = self.model.get_image_features(normalise_pixels(relit_pixels))
             parts["views"] = symmetric_info_nce(image, second, self.model.config.temperature)
         if self.reader is not None:
             parts["attributes"] = F.mse_loss(self.reader(image.float()), batch["attributes"])
@@ -79,11 +83,32 @@ class ImageTextObjective(nn.Module):
 
 
 def recoloured(pictures: Tensor) -> Tensor:
-    """Pictures (B, 3, S, S) in [0, 1] of which colour and brightness tell no more: shifted, some blurred or grey."""
-    other = batches.permute_channels(batches.shift_pixels(pictures, 2), 0.5)
-    other = batches.jitter_colours(batches.blur_some(other, 0.3), gain=0.4, offset=0.12)
-    grey = torch.rand(len(other), 1, 1, 1, device=other.device) < 0.3
-    return batches.add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
+    """Pictures (B, 3, S, S) in [0, 1], shifted, with other colours and brightness, some blurred or grey."""
+    changed = batches.shift_pixels(pictures, 2)
+    changed = batches.permute_channels(changed, 0.5)
+    changed = batches.blur_some(changed, 0.3)
+    changed = batches.jitter_colours(changed, gain=0.4, offset=0.12)
+    is_grey = torch.rand(len(changed), 1, 1, 1, device=changed.device) < 0.3
+    changed = torch.where(is_grey, changed.mean(dim=1, keepdim=True), changed)
+    return batches.add_noise(changed, 0.03)
+
+
+def continued_model(init: Path) -> UniTouchModel:
+    """The image and text encoders of a joint space; its touch and audio were bound to the pictures' old embeddings."""
+    initial = UniTouchModel.from_pretrained(init, modalities=("image", "text"))
+    initial.config.ood_thresholds = {}
+    initial.config.sensor_reaches = {}
+    model = UniTouchModel(initial.config, modalities=())  # type: ignore[arg-type]
+    for modality in ("image", "text"):
+        model.load_tensors(modality, initial.state_dict())
+    return model
+
+
+def fresh_model(config: UniTouchConfig, tokenizer: PreTrainedTokenizerBase) -> UniTouchModel:
+    """Random image and text encoders for the words of a tokenizer."""
+    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    config.text_config.update({"vocab_size": len(tokenizer), **special})  # type: ignore[union-attr]
+    return UniTouchModel(config, modalities=("image", "text"))
 
 
 def main(stage: Stage, recipe: ImageTextRecipe) -> None:
@@ -93,36 +118,28 @@ def main(stage: Stage, recipe: ImageTextRecipe) -> None:
     stage.check_drawn(*(name for name in ("views", "attributes") if getattr(objective, name)))
     splits = stage.splits("image", "text")
     processor = stage.processor
-    captions = [texts for source in stage.sources for texts in source.captions(objective.captions)]
-    texts = [caption for one in captions for caption in one]
+    captions_of_contacts = [texts for source in stage.sources for texts in source.captions(objective.captions)]
+    captions = [caption for texts in captions_of_contacts for caption in texts]
     if init is not None:
-        begun = UniTouchModel.from_pretrained(init, modalities=("image", "text"))
-        begun.config.ood_thresholds = {}
-        begun.config.sensor_reaches = {}
-        # Its touch and audio are bound to what its pictures were.
-        model = UniTouchModel(begun.config, modalities=())  # type: ignore[arg-type]
-        for modality in ("image", "text"):
-            model.load_tensors(modality, begun.state_dict())
+        model = continued_model(init)
     else:
-        processor.tokenizer = tokenizer = read_tokenizer("tokenizer", JOINT)
-        special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
-        config.text_config.update({"vocab_size": len(tokenizer), **special})  # type: ignore[union-attr]
-        model = UniTouchModel(config, modalities=("image", "text"))
+        processor.tokenizer = read_tokenizer("tokenizer", JOINT)
+        model = fresh_model(config, processor.tokenizer)
 
     data: dict[str, Any] = {"image": [split.image for split in splits]}
     if objective.attributes:
-        chosen = [ATTRIBUTES.index(name) for name in SHOWN]
-        measured = [split.attributes[:, :, chosen].mean(dim=1) for split in splits]  # by both sensors
+        shown = [ATTRIBUTES.index(name) for name in SHOWN]
+        measured = [split.attributes[:, :, shown].mean(dim=1) for split in splits]  # mean over both sensors
         data["attributes"] = in_deviations(torch.cat(measured).numpy())
-    data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
+    tokens = processor.text(captions)["input_ids"]
+    data["input_ids"] = tokens.unflatten(0, (len(captions_of_contacts), objective.captions))
     if objective.views:
         pairs = zip(stage.sources, splits, strict=True)
         data["relit"] = [relit(stage.cache, source, "train", split) for source, split in pairs]  # type: ignore[arg-type]
     sampler = None
     if recipe.sampler.group > 1:
         sampler = stage.sampler(recipe.sampler, splits, stage.image_embeddings(model, splits))
-    trained = ImageTextObjective(model, objective)
-    stage.fit(trained, ArrayDataset(**data), sampler)
+    stage.fit(ImageTextObjective(model, objective), ArrayDataset(**data), sampler)
 
     embeddings = stage.image_embeddings(model, splits).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings, axis=1).mean())

@@ -1,7 +1,7 @@
-"""Stage 4, the autoencoder of pictures, and the objective that stage 6, of touches, shares.
+"""The autoencoder of pictures (stage `image_vae`) and of touches (stage `touch_vae`).
 
-Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers' own unCLIP pipelines take as well as an
-`AutoencoderKL`, at a fraction of its time, and the paper's `VQModel` (Esser et al., 2021).
+Recipes take two classes. `AutoencoderTiny` (after TAESD, Boer Bohan, 2023) fits diffusers' own unCLIP pipelines in the
+place of an `AutoencoderKL`, at a fraction of its time. `VQModel` (Esser et al., 2021) is the paper's.
 """
 
 import json
@@ -34,23 +34,23 @@ from unitouch_gen.training.stages import Recipe, Stage
 
 
 class AutoencoderLoss(Settings):
-    """What is added to the L1 error of the pixels."""
+    """Losses that are added to the L1 error of the pixels."""
 
     gradient_weight: NonNegativeFloat  # of the L1 error of differences between neighbouring pixels, for crisp edges
-    # Deviation of noise on the latents, relative to theirs, so that the decoder forgives a generator its last errors.
+    # Deviation of noise on the latents, relative to theirs. The decoder learns to ignore a generator's last errors.
     latent_noise: NonNegativeFloat
     latent_weight: NonNegativeFloat  # of the latents' mean square, which keeps them bounded
     feature_weight: NonNegativeFloat = 0.0  # of `feature_error`, by the touch encoder of the joint space
 
 
 class AutoencoderAugmentation(Settings):
-    # Side of the squares that a network of convolutions learns from; null for whole images. A quarter of the pixels
-    # cost a quarter of the time, and twice as many images are worth more than whole ones.
+    # Side of the square crops that are trained on; null for whole images. A quarter of the pixels take a quarter of the
+    # time, and twice as many crops teach more than whole images.
     crop: PositiveInt | None = None
 
 
 class AutoencoderRecipe(Recipe):
-    model: Arguments  # `class`, and that one's arguments
+    model: Arguments  # `class`, and the arguments of that class
     loss: AutoencoderLoss
     augment: AutoencoderAugmentation = AutoencoderAugmentation()
 
@@ -67,34 +67,45 @@ class AutoencoderObjective(nn.Module):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
-        if self.crop is not None:  # a square at one random place for all, no larger than they are
-            top, left = (int(torch.randint(max(size - self.crop, 0) + 1, ())) for size in pixels.shape[-2:])
-            pixels = pixels[..., top : top + self.crop, left : left + self.crop]
+        if self.crop is not None:
+            pixels = random_crop(pixels, self.crop)
         latents = encode_raw(self.trained, pixels).float()
-        size = latents.square().mean()
+        latent_size = latents.square().mean()
         noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
         decoded = self.trained.decode(latents + noise)
         restored = decoded.sample.float()
         edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
-        loss = F.l1_loss(restored, pixels) + self.weights.gradient_weight * edges + self.weights.latent_weight * size
+        loss = F.l1_loss(restored, pixels)
+        loss = loss + self.weights.gradient_weight * edges
+        loss = loss + self.weights.latent_weight * latent_size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
         if self.layers:
             loss = loss + self.weights.feature_weight * feature_error(self.layers, restored, pixels)
-        psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
-        return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+        psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # of pixels in [0, 1]
+        return {"loss": loss, "psnr": psnr, "latent": latent_size.detach()}
 
 
-def feature_error(layers: Sequence[nn.Module], images: Tensor, wanted: Tensor) -> Tensor:
+def random_crop(pixels: Tensor, side: int) -> Tensor:
+    """A square of each image (B, 3, H, W), at the same random place, no larger than the images."""
+    height, width = pixels.shape[-2:]
+    top = int(torch.randint(max(height - side, 0) + 1, ()))
+    left = int(torch.randint(max(width - side, 0) + 1, ()))
+    return pixels[..., top : top + side, left : left + side]
+
+
+def feature_error(layers: Sequence[nn.Module], images: Tensor, targets: Tensor) -> Tensor:
     """L1 error of a stem's features of images in [-1, 1], relative to their deviation (after Johnson et al., 2016)."""
-    a = normalise_pixels(images / 2 + 0.5)
-    b = normalise_pixels(wanted / 2 + 0.5)
+    features = normalise_pixels(images / 2 + 0.5)
+    target_features = normalise_pixels(targets / 2 + 0.5)
     errors = list[Tensor]()
     for layer in layers:
-        a = layer.to(a.device)(a)
-        b = layer(b)
+        features = layer.to(features.device)(features)
+        target_features = layer(target_features)
         if isinstance(layer, Residual) or layer is layers[-1]:
-            errors.append(((a - b).abs().mean((0, 2, 3)) / b.std((0, 2, 3)).clamp_min(1e-3)).mean())
+            error = (features - target_features).abs().mean((0, 2, 3))
+            deviation = target_features.std((0, 2, 3)).clamp_min(1e-3)
+            errors.append((error / deviation).mean())
     return torch.stack(errors).mean()
 
 
@@ -107,30 +118,38 @@ def to_signed(pixels: Tensor) -> Tensor:
 def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
     """1 / standard deviation of the latents of 2,048 images (Rombach et al., 2022, appendix G)."""
     order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:2048].tolist()
-    batches = (dataset[order[start : start + 128]]["pixels"] for start in range(0, len(order), 128))
-    return 1.0 / torch.cat([encode_raw(vae, to_signed(pixels).to(vae.device)) for pixels in batches]).std().item()
+    latents = list[Tensor]()
+    for start in range(0, len(order), 128):
+        pixels = dataset[order[start : start + 128]]["pixels"]
+        latents.append(encode_raw(vae, to_signed(pixels).to(vae.device)))
+    return 1.0 / torch.cat(latents).std().item()
 
 
 @torch.no_grad()
 def cached_latents(
     stage: Stage, vae: Autoencoder, name: str, splits: list[Contacts], images: Iterable[np.ndarray]
 ) -> Tensor:
-    """Scaled latents of all arrays of images, which are columns of the splits, by the autoencoder to build on."""
+    """Scaled latents of `images`, columns of the splits, by the autoencoder of option `--vae`."""
 
-    def latents_of(part: Any) -> Tensor:
-        return in_batches(len(part), lambda rows: encode(vae, to_signed(torch.from_numpy(np.array(part[rows])))))
+    def encode_column(pixels: Any) -> Tensor:
+        def encode_rows(rows: Any) -> Tensor:
+            return encode(vae, to_signed(torch.from_numpy(np.array(pixels[rows]))))
 
-    file = f"{name}-latents-scale{vae.config.scaling_factor:.6g}"
-    return stage.computed_once(file, "vae", splits, lambda: torch.cat([latents_of(part) for part in images]))
+        return in_batches(len(pixels), encode_rows)
+
+    def encode_all() -> Tensor:
+        return torch.cat([encode_column(pixels) for pixels in images])
+
+    return stage.computed_once(f"{name}-latents-scale{vae.config.scaling_factor:.6g}", "vae", splits, encode_all)
 
 
 def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     modality = "touch" if stage.name == "touch_vae" else "image"
     init = stage.folders.get("init")
     crop = recipe.augment.crop
-    sizes = {**recipe.model}
-    kind = autoencoder_class("model.class", sizes.pop("class", None))
-    vae: Any = build("model", kind, sizes) if init is None else read_autoencoder(init).requires_grad_(True)
+    arguments = {**recipe.model}
+    vae_class = autoencoder_class("model.class", arguments.pop("class", None))
+    vae: Any = read_autoencoder(init).requires_grad_(True) if init else build("model", vae_class, arguments)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
     layers: list[nn.Module] = []
@@ -140,13 +159,15 @@ def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
         stem = stage.joint_space("touch").touch_model.stem.requires_grad_(False)
         layers = [*stem.children()] or [stem]
     splits = stage.splits(modality)
-    seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
-    dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
+    images = [getattr(split, modality) for split in splits]
+    if modality == "touch":
+        images += [split.second for split in splits if split.second is not None]
+    dataset = ArrayDataset(pixels=images)
     stage.fit(AutoencoderObjective(vae, recipe.loss, crop, layers), dataset)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)
-        if isinstance(vae, AutoencoderTiny):  # which writes a setting that diffusers warns of when it reads it
+        if isinstance(vae, AutoencoderTiny):  # diffusers writes a setting here that it warns of when reading
             settings = json.loads((folder / "config.json").read_text())
             del settings["block_out_channels"]
             (folder / "config.json").write_text(json.dumps(settings, indent=2) + "\n")

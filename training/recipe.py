@@ -1,4 +1,4 @@
-"""Recipes: YAML files whose sections are settings of ours, or arguments of a library's class."""
+"""Recipes: YAML files whose sections are settings of a stage, or arguments of a library's class."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -21,43 +21,45 @@ Arguments = dict[str, Any]  # a section of arguments of a library's class; `buil
 
 
 class Settings(BaseModel):
-    """A section whose fields say of which kind its values are and within which bounds; it holds no other keys."""
+    """A section of a recipe. Its fields have types and bounds, and no other keys are taken."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
-    def _knows_the_keys(cls, given: Any) -> Any:
-        check_keys(given if isinstance(given, Mapping) else (), cls.model_fields)
-        return given
+    def _check_keys(cls, values: Any) -> Any:
+        if isinstance(values, Mapping):
+            check_keys(values, cls.model_fields)
+        return values
 
 
 SettingsKind = TypeVar("SettingsKind", bound=Settings)
 
 
 def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """A YAML recipe, by its path or its name in `recipes/`, under overrides; see `overridden`.
+    """A YAML recipe, by its path or its name in `recipes/`, with overrides; see `overridden`.
 
-    A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
-    `sets` are named, they stand in the place of the contacts that the base draws.
+    A `base` in its `data` names another YAML file, whose keys are the defaults of this section. Where the recipe or the
+    overrides name data `sets`, the contacts that the base draws are left out.
     """
-    recipe = read_settings("recipe", _file_of("recipe", path), yaml.safe_load)
+    recipe = read_settings("recipe", _recipe_file("recipe", path), yaml.safe_load)
     data = recipe.get("data")
     if isinstance(data, dict) and "base" in data:
-        base = read_settings("data.base", _file_of("data.base", data.pop("base")), yaml.safe_load)
-        if "sets" in data or any(one.startswith("data.sets") for one in overrides):
+        base = read_settings("data.base", _recipe_file("data.base", data.pop("base")), yaml.safe_load)
+        if "sets" in data or any(override.startswith("data.sets") for override in overrides):
             base.pop("drawn", None)
         recipe["data"] = base | data
     return overridden(recipe, overrides)
 
 
-def _file_of(argument: str, path: str | Path) -> Path:
+def _recipe_file(argument: str, path: str | Path) -> Path:
+    """The file of a recipe, by its path or its name in `recipes/`."""
     named = RECIPES / f"{path}.yaml"
     return named if named.is_file() else as_path(argument, path)
 
 
 def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A recipe with values laid over it, such as "trainer.steps=100"; what reads the sections checks their keys."""
+    """A copy of a recipe with values replaced, such as "trainer.steps=100". Keys are checked when sections are read."""
     changed: dict[str, Any] = deepcopy(dict(recipe))
     for override in overrides:
         key, _, text = override.partition("=")
@@ -73,43 +75,49 @@ def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str,
             section[leaf] = yaml.safe_load(text)
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise InvalidInputError(f"`set` is {describe(override)}, which is no YAML: {first_line(error)}.") from error
-        with suppress(ValueError, TypeError):  # 1e-3 is a number: YAML 1.1 takes it for a string, as it holds no point
-            section[leaf] = float(section[leaf]) if isinstance(section[leaf], str) else section[leaf]
+        if isinstance(section[leaf], str):
+            with suppress(ValueError):  # YAML 1.1 reads 1e-3 as a string, since it has no point
+                section[leaf] = float(section[leaf])
     return changed
 
 
-def read(kind: type[SettingsKind], given: Any) -> SettingsKind:
-    """A recipe, or one section of it, as settings; an error names the first key that is wrong."""
+def read(kind: type[SettingsKind], values: Any) -> SettingsKind:
+    """A recipe, or one section of it, as settings of a `kind`.
+
+    Raises:
+        InvalidInputError: Naming the first key that is wrong.
+    """
     try:
-        return kind.model_validate(given)
+        return kind.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"])) or "recipe"
-        message = f"`{key}` is {describe(first['input'])}; {first['msg'].replace('Input should', 'it has to')}."
-        if "error" in first.get("ctx", {}):  # of a check of ours
+        if "error" in first.get("ctx", {}):  # raised by a validator of the package
             message = f"In `{key}`, {first['ctx']['error']}"
         elif first["type"] == "missing":
             message = f"`{key}` is missing in the recipe; set it."
+        else:
+            message = f"`{key}` is {describe(first['input'])}; {first['msg'].replace('Input should', 'it has to')}."
         raise InvalidInputError(message) from error
 
 
-def build(section: str, kind: Callable[..., Built], arguments: Arguments, **given: Any) -> Built:
-    """What a class or function makes of a recipe's section, and of arguments that are not the recipe's to say."""
+def build(section: str, kind: Callable[..., Built], arguments: Arguments, **fixed: Any) -> Built:
+    """Calls a class or function with a recipe's section and with `fixed` arguments, which the recipe may not set."""
     try:
-        check_keys(arguments, {*signature(kind).parameters} - {*given, "kwargs"})
-        for name, inner in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
-            ours = {"stem", "patch_channels"}
-            check_keys(arguments.get(name) or (), {*signature(inner).parameters, *ours} - {"kwargs"})
-        return kind(**arguments, **given)
+        check_keys(arguments, {*signature(kind).parameters} - {*fixed, "kwargs"})
+        for name, sub_config in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
+            own_keys = {"stem", "patch_channels"}
+            check_keys(arguments.get(name) or (), {*signature(sub_config).parameters, *own_keys} - {"kwargs"})
+        return kind(**arguments, **fixed)
     except InvalidInputError as error:
         raise InvalidInputError(f"In `{section}`, {error}") from error
-    except Exception as error:  # libraries refuse in many ways
+    except Exception as error:  # libraries raise many kinds of errors
         raise InvalidInputError(f"`{section}` cannot be used: {first_line(error)}") from error
 
 
-def check_keys(given: Iterable[Any], known: Iterable[str]) -> None:
-    """Refuses a key that is not known, with those that are and the one that was likely meant."""
-    for key in given:
-        if key not in known:
-            hint = did_you_mean(key, known)
-            raise InvalidInputError(f"`{key}` is unknown; there are {sorted(known)}. {hint}".strip())
+def check_keys(keys: Iterable[Any], allowed: Iterable[str]) -> None:
+    """Raises for a key that is not allowed, with those that are and the one that was likely meant."""
+    for key in keys:
+        if key not in allowed:
+            hint = did_you_mean(key, allowed)
+            raise InvalidInputError(f"`{key}` is unknown; there are {sorted(allowed)}. {hint}".strip())
