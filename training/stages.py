@@ -1,4 +1,4 @@
-"""What the stages have in common: their command line, what they are given, and the folder they leave behind."""
+"""What all stages share: their options, the models and data they read, and the folder they write."""
 
 import hashlib
 import json
@@ -44,20 +44,21 @@ STAGES: dict[str, dict[str, str]] = {
     "language_model": {"joint": "texture"},
     "touch_llm": {"joint": "texture", "llama": "language_model"},
 }
-"""All stages in order. Each names the options that take an earlier stage's output, and that stage."""
+"""All stages of a family in order, each with its options for an earlier stage's output, and that stage."""
 
 STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm", "distill")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
-NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}  # which is no part of a family
+NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}
+"""Options for folders that a stage needs, and what is expected there; `distill` is no part of a family."""
 
 FOLDERS = ("joint", "vae", "llama", "init", "model")
 """Options that name folders of models."""
 
 MODULES = {"touch_vae": "image_vae", "language_model": "touch_llm"}
-"""Modules of stages that have none of their own."""
+"""Modules of the stages that share one with another stage."""
 
-Indices = Callable[[int], Sequence[int]]  # those of a batch by the number of its step
+Indices = Callable[[int], Sequence[int]]  # sample indices of a batch, by the number of its step
 
 
 class Recipe(Settings):
@@ -68,9 +69,10 @@ class Recipe(Settings):
 
 
 class Stage:
-    """One call of a stage's command, with its options as arguments; `folders` are the models that were given.
+    """One call of a stage's command, with its options as arguments.
 
-    `recipe` is read as settings of a `kind`; `given` is what was read, for checkpoints and the record.
+    `recipe` is read as settings of a `kind`; `recipe_values` is the same as plain values, for checkpoints and the
+    record. `folders` are the models that were named, by option, and `inputs` hashes of their weights.
     """
 
     def __init__(
@@ -79,9 +81,12 @@ class Stage:
         kind: type[Recipe],
         *,
         recipe: Annotated[str | None, Option(help="A YAML file, or a name in training/recipes.")] = None,
-        overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
-        output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
-        cache: Annotated[Path, Option(help="What was rendered, and what models say of it.")] = Path("runs/cache"),
+        overrides: Annotated[
+            list[str] | None,
+            Option("--set", metavar="SECTION.KEY=VALUE", help="A value of the recipe to replace; may be repeated."),
+        ] = None,
+        output: Annotated[Path | None, Option(help="Folder to write to, and to resume from; else runs/STAGE.")] = None,
+        cache: Annotated[Path, Option(help="Folder for rendered contacts and embeddings.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
         joint: Annotated[Path | None, Option(exists=True, help="Folder of the joint space to build on.")] = None,
         vae: Annotated[Path | None, Option(exists=True, help="Folder of the autoencoder to build on.")] = None,
@@ -89,60 +94,67 @@ class Stage:
         init: Annotated[Path | None, Option(exists=True, help="Folder of weights to start from.")] = None,
         model: Annotated[Path | None, Option(exists=True, help="Folder of a saved pipeline to distil.")] = None,
     ):
-        on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
+        on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # accelerate reads this only after it has looked for GPUs
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
         self.name = name
         self.output = output or Path("runs") / name
         self.cache = cache
         self.resume = resume
-        before = read_progress(self.output) if resume else {}
-        if (found := checkpoints_in(self.output)) and not resume:
-            raise InvalidInputError(
-                f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
-                "`--resume` to go on with it, remove it, or name another output."
-            )
-        if resume and recipe is not None:
-            raise InvalidInputError("`recipe` is the checkpoint's with `--resume`; leave it out. `--set` changes it.")
         changes = overrides or ()
-        self.given = overridden(before["recipe"], changes) if resume else read_recipe(recipe or name, changes)
-        self.recipe: Any = read(kind, self.given)
+        progress = read_progress(self.output) if resume else {}
+        if resume:
+            if recipe is not None:
+                raise InvalidInputError(
+                    "`recipe` is the checkpoint's with `--resume`; leave it out. `--set` changes it."
+                )
+            self.recipe_values = overridden(progress["recipe"], changes)
+        else:
+            check_no_checkpoints(self.output)
+            self.recipe_values = read_recipe(recipe or name, changes)
+        self.recipe: Any = read(kind, self.recipe_values)
         self.trainer = self.recipe.trainer
         self.data = self.recipe.data
         self.batches: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
-        folders = {"joint": joint, "vae": vae, "llama": llama, "init": init, "model": model}
-        self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        if not {*NEEDS[name]} <= {*self.folders} <= folders_of(name):
-            given = ", ".join(f"--{option}" for option in self.folders) or "none"
-            wanted = ", ".join(f"--{option} of {before}" for option, before in NEEDS[name].items()) or "none"
-            raise InvalidInputError(f"{name} needs folders of models: {wanted}; it got {given}.")
+        self.folders = named_folders(name, joint=joint, vae=vae, llama=llama, init=init, model=model)
         self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
-        if resume and before["inputs"] != self.inputs:
-            options = ", ".join(f"--{option}" for option in before["inputs"])
-            raise InvalidInputError(
-                f"`resume` finds a run in {str(self.output)!r} that was built on other weights than {options} name "
-                "now; name those, or begin anew."
-            )
+        if resume:
+            self._check_inputs(progress["inputs"])
         self.sources = self.data.sources()
         self.sets = [source.summary for source in self.sources]
-        self.earlier_sets = before.get("earlier_sets", [])  # of a run whose data was changed on the way
-        if before.get("sets", self.sets) != self.sets:
-            if not any(change.startswith("data.") for change in changes):
-                raise InvalidInputError(
-                    f"`resume` finds a run in {str(self.output)!r} on other data than there is now: "
-                    f"{_difference(before['sets'], self.sets)}. Put the data back, or begin anew in another `output`."
-                )
-            self.earlier_sets = [*self.earlier_sets, before["sets"]]
+        self.earlier_sets = self._earlier_sets(progress, changes)
         check_writable("output", self.output / "record.json")
         check_writable("output", self.output / "model" / "config.json")
         check_writable("output", self.output / "checkpoints" / "step" / "progress.json")
         check_writable("cache", self.cache / "array.npy")
         if not self.processes.is_main_process:
-            self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
+            self.processes.wait_for_everyone()  # until the main process has filled the cache; see `fit`
+
+    def _check_inputs(self, inputs: dict[str, str]) -> None:
+        """Raises if the hashes of a checkpoint's `inputs` are not those of the folders that are named now."""
+        if inputs != self.inputs:
+            options = ", ".join(f"--{option}" for option in inputs)
+            raise InvalidInputError(
+                f"`resume` finds a run in {str(self.output)!r} that was built on other weights than {options} name "
+                "now; name those, or begin anew."
+            )
+
+    def _earlier_sets(self, progress: dict[str, Any], changes: Sequence[str]) -> list[Any]:
+        """Summaries of the data that a resumed run was trained on before its data was changed."""
+        earlier_sets = progress.get("earlier_sets", [])
+        before = progress.get("sets", self.sets)
+        if before == self.sets:
+            return earlier_sets
+        if not any(change.startswith("data.") for change in changes):
+            raise InvalidInputError(
+                f"`resume` finds a run in {str(self.output)!r} on other data than there is now: "
+                f"{_difference(before, self.sets)}. Put the data back, or begin anew in another `output`."
+            )
+        return [*earlier_sets, before]
 
     @cached_property
     def processor(self) -> UniTouchProcessor:
-        """That of the pipeline, the joint space, or the weights to start from; else what the recipe says."""
+        """The processor of the pipeline, the joint space, or the weights to start from; else by the recipe."""
         if "model" in self.folders:
             return UniTouchProcessor.from_pretrained(self.folders["model"] / "processor")
         init = self.folders.get("init")
@@ -153,11 +165,12 @@ class Stage:
         return UniTouchProcessor(image_size=self.data.image_size, audio=self.data.audio)  # type: ignore[arg-type]
 
     def joint_space(self, *modalities: str) -> UniTouchModel:
+        """The joint space of `--joint`, or of the pipeline of `--model`."""
         folder = self.folders["model"] / "unitouch" if "model" in self.folders else self.folders["joint"]
         return UniTouchModel.from_pretrained(folder, modalities=modalities)
 
     def unet(self, model: Arguments, **conditions: Any) -> UNet2DConditionModel:
-        """The network: random by the recipe and `conditions`, or the weights that were named to start from."""
+        """The UNet of `--init`; else a random one, by the recipe's section `model` and `conditions`."""
         if "init" not in self.folders:
             return build("model", UNet2DConditionModel, model, **conditions)
         init = self.folders["init"]
@@ -168,19 +181,28 @@ class Stage:
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
     def computed_once(self, name: str, option: str, splits: list[Contacts], compute: Callable[[], Tensor]) -> Tensor:
-        """What a model makes of `splits`: once for the weights that an option named, at each call if none did."""
+        """What a model computes of `splits`, cached by the weights of the folder that `option` names.
+
+        If that option names no folder, the model is random or changed, and nothing is cached.
+        """
         weights = self.inputs.get("model", self.inputs.get(option))
         if weights is None:
             return compute()
-        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()
-        names = [*(Path(one.path).name for one in self.data.sets), *(["drawn"] if self.data.drawn else [])]
-        file = "-".join([name, *names, "train", shown[:16], weights[:16]])
+        fingerprints = "".join(split.fingerprint for split in splits)
+        splits_hash = hashlib.sha256(fingerprints.encode()).hexdigest()
+        data_names = [Path(data_set.path).name for data_set in self.data.sets]
+        if self.data.drawn:
+            data_names.append("drawn")
+        file = "-".join([name, *data_names, "train", splits_hash[:16], weights[:16]])
         return computed_once(self.cache / f"{file}.safetensors", compute)
 
     def image_embeddings(self, model: UniTouchModel, splits: list[Contacts]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised."""
-        parts = (image_embeddings(model.eval(), "image", split.image) for split in splits)  # computed when asked for
-        return self.computed_once("image-embeddings", "joint", splits, lambda: torch.cat([*parts]))
+
+        def compute() -> Tensor:
+            return torch.cat([image_embeddings(model.eval(), "image", split.image) for split in splits])
+
+        return self.computed_once("image-embeddings", "joint", splits, compute)
 
     def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
         """Batches in groups whose embeddings (N, D) are alike."""
@@ -189,18 +211,26 @@ class Stage:
         return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)
 
     def check_drawn(self, *weights: str) -> None:
-        """Refuses data sets where the objective weighs what only drawn contacts have."""
+        """Raises if there are data sets, and `weights` of the objective are for what only drawn contacts have."""
         if weights and not all(isinstance(source, DrawnContacts) for source in self.sources):
             names = ", ".join(f"`objective.{name}`" for name in weights)
             raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
 
     def fit(self, objective: nn.Module, dataset: ArrayDataset, indices_of: Indices | None = None) -> None:
-        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
+        """Trains an objective to its last step, with `--resume` from the last checkpoint.
+
+        Batches are of shuffled epochs, if `indices_of` is left out.
+        """
         if self.processes.is_main_process:
-            self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
+            self.processes.wait_for_everyone()  # the cache is filled; the other processes go on and read it
         indices_of = indices_of or partial(shuffled_indices, size=len(dataset), **self.batches)
-        begun = {"inputs": self.inputs, "recipe": self.given, "sets": self.sets, "earlier_sets": self.earlier_sets}
-        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, begun)
+        progress = {
+            "inputs": self.inputs,
+            "recipe": self.recipe_values,
+            "sets": self.sets,
+            "earlier_sets": self.earlier_sets,
+        }
+        trainer = Trainer(objective, dataset, indices_of, config=self.trainer, output=self.output, progress=progress)
         if self.resume:
             trainer.resume()
         trainer.fit()
@@ -208,7 +238,7 @@ class Stage:
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
-        """The folder to write the stage's model to; `record.json` beside it has seed, recipe, inputs and times."""
+        """The folder to write the stage's model to. `record.json` beside it has seed, recipe, inputs and times."""
         record: dict[str, Any] = {
             "stage": self.name,
             "seed": self.trainer.seed,
@@ -216,37 +246,69 @@ class Stage:
             "version": __version__,
             "inputs": self.inputs,
             "trainer": self.trainer.model_dump(),
-            "recipe": {key: value for key, value in self.given.items() if key != "trainer"},
+            "recipe": {key: value for key, value in self.recipe_values.items() if key != "trainer"},
             "sets": self.sets,
-            **({"earlier_sets": self.earlier_sets} if self.earlier_sets else {}),
-            **figures,
         }
-        for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
-            if (beside / "record.json").is_file():  # beside a run's `model`, or a part of that
-                record["started_from"] = json.loads((beside / "record.json").read_text())
-        main = self.processes.is_main_process  # what the others write is discarded
-        with filling("output", self.output) if main else TemporaryDirectory() as place:
-            model = Path(place) / "model"
+        if self.earlier_sets:
+            record["earlier_sets"] = self.earlier_sets
+        record.update(figures)
+        if "init" in self.folders:
+            # The record of a run lies beside its `model`, and `init` may name that folder or a part of it.
+            for folder in self.folders["init"].resolve().parents[:2]:
+                if (folder / "record.json").is_file():
+                    record["started_from"] = json.loads((folder / "record.json").read_text())
+        main = self.processes.is_main_process  # what the other processes write is discarded
+        with filling("output", self.output) if main else TemporaryDirectory() as output:
+            model = Path(output) / "model"
             model.mkdir()
             yield model
             (model.parent / "record.json").write_text(json.dumps(record, indent=2) + "\n")
 
 
 def _difference(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> str:
-    """The first data set that is not what it was, in words."""
-    one, other = next(pair for pair in zip_longest(before, now) if pair[0] != pair[1])
-    return f"{json.dumps(one) if one else 'nothing'} then, {json.dumps(other) if other else 'nothing'} now"
+    """The first data set that differs between two runs, in words."""
+
+    def in_words(summary: dict[str, Any] | None) -> str:
+        return json.dumps(summary) if summary else "nothing"
+
+    pairs = zip_longest(before, now)
+    summary_before, summary_now = next(pair for pair in pairs if pair[0] != pair[1])
+    return f"{in_words(summary_before)} then, {in_words(summary_now)} now"
+
+
+def check_no_checkpoints(output: Path) -> None:
+    """Raises if a folder holds checkpoints, which a new run would remove."""
+    checkpoints = checkpoints_in(output)
+    if checkpoints:
+        raise InvalidInputError(
+            f"`output` is {str(output)!r}, which holds {checkpoints[-1].name} of a run that would be lost; pass "
+            "`--resume` to go on with it, remove it, or name another output."
+        )
 
 
 def folders_of(name: str) -> set[str]:
     """The options of a stage that name folders of models; all but `init` are needed."""
-    return {*NEEDS[name], *(["init"] if name in STARTING_FROM_WEIGHTS else [])}
+    options = {*NEEDS[name]}
+    if name in STARTING_FROM_WEIGHTS:
+        options.add("init")
+    return options
+
+
+def named_folders(name: str, **folders: Path | None) -> dict[str, Path]:
+    """The folders of models that were named, by option; raises if a stage needs others, or does not take one."""
+    named = {option: folder for option, folder in folders.items() if folder is not None}
+    if not {*NEEDS[name]} <= {*named} <= folders_of(name):
+        needed = ", ".join(f"--{option} of {stage}" for option, stage in NEEDS[name].items()) or "none"
+        given = ", ".join(f"--{option}" for option in named) or "none"
+        raise InvalidInputError(f"{name} needs folders of models: {needed}; it got {given}.")
+    return named
 
 
 def weights_of(folder: Path) -> str:
-    """SHA-256 of all the safetensors below a folder, also behind links: of their names and bytes."""
+    """SHA-256 of the names and bytes of all safetensors below a folder, also behind links."""
     digest = hashlib.sha256()
-    files = [file for file in files_below(folder) if not is_hidden(file.relative_to(folder))]  # as of a save cut off
+    # A save that was cut off leaves hidden files.
+    files = [file for file in files_below(folder) if not is_hidden(file.relative_to(folder))]
     for file in sorted(file for file in files if file.suffix == ".safetensors"):
         digest.update(f"{file.relative_to(folder).as_posix()}\n".encode())
         with file.open("rb") as stream:
@@ -255,7 +317,7 @@ def weights_of(folder: Path) -> str:
 
 
 def run_stage(name: str, **options: Any) -> None:
-    """Runs a stage by its options, from its seed; `recipe` of its `main` says what it is read as."""
+    """Runs a stage with its options. The annotation of `recipe` in its `main` is what the recipe is read as."""
     main = import_module(f"unitouch_gen.training.{MODULES.get(name, name)}").main
     stage = Stage(name, main.__annotations__["recipe"], **options)
     torch.manual_seed(stage.trainer.seed)
