@@ -1,6 +1,6 @@
-"""Stage 3, touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
+"""Touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
 
-At its end it fits the distance that tells which touches are unlike those the encoder was trained on.
+After training, `fit_distance` fits the distance by which touches unlike the training data are recognised.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,38 +27,38 @@ from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
-ABSTAINED = 0.046  # share of the touches of training that are beyond the threshold
+ABSTAINED = 0.046  # share of the training touches that are beyond the threshold
 
 
 class TouchAugmentation(Settings):
-    """Probabilities of exchanging colours, and of softening: other lights and gels."""
+    """Probabilities of permuting channels, as other lights would, and of blurring, as a softer gel would."""
 
     permute: Share
     blur: Share
 
 
 class SensorSettings(Settings):
-    tokens: NonNegativeInt | None = None  # of each; null for the joint space's number, 0 trains without sensors
+    tokens: NonNegativeInt | None = None  # of each sensor; null for the joint space's number, 0 for no sensor tokens
 
 
 class LossWeights(Settings):
     """Weights of losses: the paper's, the distance of a touch to its picture, and three that need drawn contacts."""
 
     image: NonNegativeFloat = 1.0  # InfoNCE of touches and their pictures (Eq. 2-3)
-    # 1 - cosine(touch, picture). InfoNCE asks only that others are further, and leaves touches far from all pictures
-    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing.
+    # 1 - cosine(touch, picture). InfoNCE asks only that other pictures are further away. It leaves touches in a region
+    # of their own (Liang et al., 2022, "Mind the gap"), for which generators are not trained.
     cosine: NonNegativeFloat = 0.0
     touch: NonNegativeFloat = 0.0  # InfoNCE of the same contact under two sensors
-    attributes: NonNegativeFloat = 0.0  # squared error of a contact's measures, read linearly off its embedding
-    maps: NonNegativeFloat = 0.0  # the same of measures in each part of the view, read off the patches' tokens
+    attributes: NonNegativeFloat = 0.0  # squared error of a contact's attributes, by a linear layer on its embedding
+    maps: NonNegativeFloat = 0.0  # squared error of attributes in each part of the view, by one on the patch tokens
 
     @property
     def pairs(self) -> list[str]:
-        """The weights above 0 of what only drawn contacts have."""
+        """Names of the losses that need drawn contacts and have a weight above 0."""
         return [name for name in ("touch", "attributes", "maps") if getattr(self, name)]
 
     @model_validator(mode="after")
-    def _something_is_weighed(self) -> Self:
+    def _has_a_loss(self) -> Self:
         if not (self.image or self.cosine or self.pairs):
             raise InvalidInputError(f"`objective` weighs nothing; give one of {[*type(self).model_fields]} a weight.")
         return self
@@ -72,7 +72,7 @@ class TouchRecipe(Recipe):
 
 
 class TouchEncoder(nn.Module):
-    """What is trained: the touch transformer, the sensor tokens, and what reads measures off embeddings and patches."""
+    """The trained modules: touch transformer, sensor tokens, and linear layers for attributes and maps."""
 
     def __init__(self, model: UniTouchModel, weights: LossWeights):
         super().__init__()
@@ -84,12 +84,13 @@ class TouchEncoder(nn.Module):
         self.mapper = nn.Linear(config.hidden_size, len(MAPS)) if weights.maps else None
 
     def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8).
+        """Embeddings (B, D), and patch tokens pooled to the cells of the view, (B, width, 8, 8).
 
-        Those of sensors below 0 have no tokens.
+        Touches whose sensor id is below 0 get no sensor tokens.
         """
         tokens = self.bank.encode(self._tokens, self.transformer.stem(pixel_values), sensor_ids)
-        tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
+        # DistributedDataParallel waits for a gradient of every weight.
+        tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)
         patches = self.transformer.norm(tokens[:, 1:]).transpose(1, 2).unflatten(2, self.grid)
         embeds = self.transformer.embed(tokens)
         if self.transformer.texture is not None:
@@ -104,7 +105,7 @@ class TouchEncoder(nn.Module):
 
 
 class TouchObjective(nn.Module):
-    """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and frozen embeddings of their pictures, and other losses."""
+    """Eq. 2-3: L_{T -> V} + L_{V -> T} of touches and frozen embeddings of their pictures, and other losses."""
 
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation, weights: LossWeights | None = None):
         super().__init__()
@@ -114,32 +115,38 @@ class TouchObjective(nn.Module):
         self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        trained = self.trained
-        weights = self.weights
-        touch, patches = trained(self.augmented(batch["touch"]), batch["sensor"])
+        encoder = self.trained
+        touch, patches = encoder(self.augmented(batch["touch"]), batch["sensor"])
         picture = batch["image_embeds"]
-        parts = {"image": symmetric_info_nce(touch, picture, self.temperature)}
-        parts["cosine"] = cosine_distance(touch, picture)
-        if weights.pairs:
-            unnamed = torch.full_like(batch["sensor"], -1)
-            second, other_patches = trained(self.augmented(batch["second"]), unnamed)
-            parts["image"] = 0.5 * (parts["image"] + symmetric_info_nce(second, picture, self.temperature))
-            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture)
-            parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
-            if trained.reader is not None:
-                read = trained.reader(torch.stack([touch, second], dim=1).float())
-                parts["attributes"] = F.mse_loss(read, batch["attributes"])
-            if trained.mapper is not None:
-                both = torch.stack([patches, other_patches], dim=1).movedim(2, -1)  # (B, 2, 8, 8, width)
-                parts["maps"] = F.mse_loss(trained.mapper(both).movedim(-1, 2), batch["maps"].float())
-        loss = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
-        return {"loss": loss, **{name: part.detach() for name, part in parts.items()}}
+        losses = {
+            "image": symmetric_info_nce(touch, picture, self.temperature),
+            "cosine": cosine_distance(touch, picture),
+        }
+        if self.weights.pairs:
+            no_sensor = torch.full_like(batch["sensor"], -1)
+            second, second_patches = encoder(self.augmented(batch["second"]), no_sensor)
+            losses["image"] = 0.5 * (losses["image"] + symmetric_info_nce(second, picture, self.temperature))
+            losses["cosine"] = losses["cosine"] + cosine_distance(second, picture)
+            losses["touch"] = symmetric_info_nce(touch, second, self.temperature)
+            if encoder.reader is not None:
+                attributes = encoder.reader(torch.stack([touch, second], dim=1).float())  # (B, 2, K)
+                losses["attributes"] = F.mse_loss(attributes, batch["attributes"])
+            if encoder.mapper is not None:
+                both_patches = torch.stack([patches, second_patches], dim=1).movedim(2, -1)  # (B, 2, 8, 8, width)
+                maps = encoder.mapper(both_patches).movedim(-1, 2)  # (B, 2, 4, 8, 8)
+                losses["maps"] = F.mse_loss(maps, batch["maps"].float())
+        weighted = [getattr(self.weights, name) * loss for name, loss in losses.items()]
+        detached = {name: loss.detach() for name, loss in losses.items()}
+        return {"loss": torch.stack(weighted).sum(), **detached}
 
     def augmented(self, touch: Tensor) -> Tensor:
-        """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
-        raw = batches.permute_channels(batches.shift_pixels(touch.float() / 255, 4), self.augment.permute)
-        raw = batches.blur_some(raw, self.augment.blur)
-        return normalise_pixels(batches.add_noise(batches.jitter_colours(raw, gain=0.15, offset=0.08), 0.02))
+        """Pixel values (B, 3, S, S) of uint8 touches, as under other lights and gels."""
+        pixels = batches.shift_pixels(touch.float() / 255, 4)
+        pixels = batches.permute_channels(pixels, self.augment.permute)
+        pixels = batches.blur_some(pixels, self.augment.blur)
+        pixels = batches.jitter_colours(pixels, gain=0.15, offset=0.08)
+        pixels = batches.add_noise(pixels, 0.02)
+        return normalise_pixels(pixels)
 
 
 def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
@@ -148,7 +155,7 @@ def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
-    """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them."""
+    """Copies the touch encoder of another model, and the tokens of the sensors that both models name."""
     with reading("init", folder):
         transformer, bank = UniTouchModel.from_pretrained(folder).load("touch")
     try:
@@ -162,61 +169,73 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
 
 
 def spread(values: Any, count: int = 500) -> Any:
-    """At most `count` rows, spread over all."""
+    """At most `count` rows, evenly spaced."""
     return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))]
 
 
 def set_prototypes(model: UniTouchModel, splits: list[Contacts], reaches: bool = False) -> None:
-    """Each sensor's prototype: the mean of all raw images it took in training.
+    """Sets each sensor's prototype to the mean of its raw training images.
 
-    With `reaches`, also the distance that nearly all of these are within. Touches beyond it get no tokens, so the
-    encoder has to be trained without tokens, too.
+    With `reaches`, also sets the distance within which nearly all of these images are. Touches beyond it get no sensor
+    tokens, so the encoder has to be trained without tokens, too.
     """
     model.config.sensor_reaches = {}
     for name in model.sensor_bank.names:
-        parts = [split.touch for split in splits if split.sensors[0] == name]
-        mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / sum(map(len, parts)) / 255.0
+        touches = [split.touch for split in splits if split.sensors[0] == name]
+        total = sum(images.sum(axis=0, dtype=np.float64) for images in touches)
+        mean = total / sum(map(len, touches)) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
         model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
         if reaches:
-            own = torch.from_numpy(np.concatenate([spread(part) for part in parts])) / 255
-            distances = layout_distances(own, model.sensor_bank.prototype(name))
+            sample = torch.from_numpy(np.concatenate([spread(images) for images in touches])) / 255
+            distances = layout_distances(sample, model.sensor_bank.prototype(name))
             model.config.sensor_reaches[name] = distances.quantile(1.0 - ABSTAINED / 2).item()
 
 
 def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> Gaussians:
     """Gaussians of one covariance around the mean of each class, of features (N, F) with int64 labels (N,).
 
-    `shrinkage` is the share of the covariance, of features in units of their deviation, that is the unit matrix.
+    The covariance, of features in units of their deviation, is shrunk towards the unit matrix by `shrinkage`.
     """
     values = features.double()
-    names, rows = labels.unique(return_inverse=True)
-    means = torch.stack([values[rows == row].mean(dim=0) for row in range(len(names))])
+    classes, class_of_row = labels.unique(return_inverse=True)
+    means = torch.stack([values[class_of_row == number].mean(dim=0) for number in range(len(classes))])
     deviation = values.std(dim=0).clamp_min(1e-6)
-    residuals = (values - means[rows]) / deviation
+    residuals = (values - means[class_of_row]) / deviation
     covariance = residuals.T @ residuals / len(residuals)
-    scale, axes = torch.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * torch.eye(len(covariance)).double())
+    unit = torch.eye(len(covariance)).double()
+    scale, axes = torch.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * unit)
     return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
 
 
 @torch.no_grad()
 def fit_distance(model: UniTouchModel, splits: Sequence[Contacts]) -> None:
-    """Gives a model the distance of touches, by class where materials are known, and its threshold."""
+    """Fits the distance of touches to the training data, by material where these are known, and its threshold."""
     stem = model.touch_model.stem
     weight = model.touch_model.projection.weight
 
     def statistics(images: Iterable[np.ndarray]) -> Tensor:
-        pixels = torch.from_numpy(np.concatenate([spread(part) for part in images]))
-        parts = (normalise_pixels(part.float() / 255) for part in pixels.split(256))
-        return torch.cat([touch_statistics(stem(part.to(weight)), part) for part in parts]).cpu()
+        sample = torch.from_numpy(np.concatenate([spread(column) for column in images]))
+        rows = list[Tensor]()
+        for part in sample.split(256):
+            pixels = normalise_pixels(part.float() / 255)
+            rows.append(touch_statistics(stem(pixels.to(weight)), pixels))
+        return torch.cat(rows).cpu()
 
-    cover = ATTRIBUTES.index("cover")  # what touches nothing is not known by its touch
-    pressed = [torch.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover] for one in splits]
-    rows = torch.cat([*map(spread, pressed)]) > 0.0
-    # Data sets number materials in their own ways, so all of theirs are one class.
-    known = [one.material if one.attributes is not None else torch.full((len(one),), -1) for one in splits]
-    materials = torch.cat([*map(spread, known)])[rows]
-    touches = statistics(split.touch for split in splits)[rows]
+    cover = ATTRIBUTES.index("cover")
+    covers = list[Tensor]()
+    materials_of = list[Tensor]()
+    for split in splits:
+        if split.attributes is None:
+            # Every data set numbers its materials in its own way, so all of them are one class.
+            covers.append(torch.ones(len(split)))
+            materials_of.append(torch.full((len(split),), -1))
+        else:
+            covers.append(split.attributes[:, 0, cover])
+            materials_of.append(split.material)
+    touching = torch.cat([*map(spread, covers)]) > 0.0  # touches of nothing tell nothing about a material
+    materials = torch.cat([*map(spread, materials_of)])[touching]
+    touches = statistics(split.touch for split in splits)[touching]
     pictures = statistics(split.image for split in splits)
     distance = RelativeDistance(fit_gaussians(touches, materials), fit_gaussians(pictures, torch.zeros(len(pictures))))
     model.out_of_distribution["touch"] = distance
@@ -224,25 +243,27 @@ def fit_distance(model: UniTouchModel, splits: Sequence[Contacts]) -> None:
 
 
 def pairs_of(splits: list[Contacts]) -> dict[str, Any]:
-    """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation."""
+    """Columns of second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8), the latter two as z-scores."""
     attributes = torch.cat([split.attributes for split in splits]).numpy()
+    maps = np.concatenate([split.maps for split in splits])
     return {
         "second": [split.second for split in splits],
         "attributes": in_deviations(attributes, (0, 1)),
-        "maps": in_deviations(np.concatenate([split.maps for split in splits]), (0, 1, 3, 4)).astype(np.float16),
+        "maps": in_deviations(maps, (0, 1, 3, 4)).astype(np.float16),
     }
 
 
 def main(stage: Stage, recipe: TouchRecipe) -> None:
     stage.check_drawn(*recipe.objective.pairs)
-    share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
+    share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # raises before anything is decoded
     model = stage.joint_space("image")
     splits = stage.splits("image", "touch", "sensor")
     embeds = stage.image_embeddings(model, splits)
-    tokens = recipe.sensors.tokens
-    names = dict.fromkeys(name for split in splits for name in split.sensors)
-    model.config.sensors = [] if tokens == 0 else [name for name in names if name is not None]
-    model.config.sensor_tokens = tokens or model.config.sensor_tokens
+    model.config.sensors = []
+    if recipe.sensors.tokens != 0:
+        sensors = dict.fromkeys(name for split in splits for name in split.sensors)
+        model.config.sensors = [name for name in sensors if name is not None]
+    model.config.sensor_tokens = recipe.sensors.tokens or model.config.sensor_tokens
     model.add("touch")
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
@@ -250,14 +271,15 @@ def main(stage: Stage, recipe: TouchRecipe) -> None:
         model.touch_model.texture.load_state_dict(model.vision_model.texture.state_dict())
     set_prototypes(model, splits, reaches=bool(recipe.objective.pairs))
 
-    dataset = ArrayDataset(
-        image_embeds=embeds,
-        sensor=sensor_numbers(splits, model.config.sensors),
-        touch=[split.touch for split in splits],
-        **(pairs_of(splits) if recipe.objective.pairs else {}),
-    )
+    columns: dict[str, Any] = {
+        "image_embeds": embeds,
+        "sensor": sensor_numbers(splits, model.config.sensors),
+        "touch": [split.touch for split in splits],
+    }
+    if recipe.objective.pairs:
+        columns |= pairs_of(splits)
     objective = TouchObjective(model, recipe.augment, recipe.objective)
-    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds))
+    stage.fit(objective, ArrayDataset(**columns), stage.sampler(recipe.sampler, splits, embeds))
     fit_distance(model, splits)
     with stage.saving() as folder:
         model.save_pretrained(folder)

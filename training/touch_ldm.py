@@ -1,14 +1,14 @@
-"""Stage 7, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
+"""Touches from image embeddings by latent diffusion (Rombach et al., 2022; Section 4.6 of the paper).
 
-It is trained on image embeddings alone, so text and sound, bound to images, can take their place. The autoencoder and
-the encoder of the condition are frozen: what they say of the training data is computed once.
+The model is trained on image embeddings alone, so text and sound, bound to images, can take their place. The
+autoencoder and the encoder of the condition are frozen, and their outputs on the training data are computed once.
 
-Of drawn contacts, the network is shown what the sensor sees untouched beside the noise, as InstructPix2Pix (Brooks et
-al., 2023) is shown its picture. So it learns sensors that have no name, too: their class is the one behind those of the
-named ones.
+With drawn contacts, the untouched image of the sensor is a second input beside the noise, as the picture is in
+InstructPix2Pix (Brooks et al., 2023). So the model learns sensors without a name, too. They share the last class label.
 """
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,16 +33,16 @@ from unitouch_gen.training.stages import Recipe, Stage
 
 
 class TouchDiffusionSettings(Settings):
-    """What the conditions go through in training."""
+    """Dropout and noise of the conditions."""
 
     condition_dropout: Share  # probability of training a sample without condition, for guidance; its token is zeros
-    noisy_share: Share  # of perturbed conditions, since those of other modalities lie beside the images' own
-    condition_noise: NonNegativeFloat  # largest norm of that perturbation, relative to the embedding's
+    noisy_share: Share  # share of perturbed conditions; embeddings of other modalities lie beside the images' own
+    condition_noise: NonNegativeFloat  # largest norm of the perturbation, relative to the embedding's
     step_power: StepPower
 
 
 class BankSettings(Settings):
-    size: PositiveInt  # image embeddings that are kept for conditions to be moved to
+    size: PositiveInt  # number of image embeddings to keep
 
 
 class TouchDiffusionRecipe(Recipe):
@@ -55,8 +55,8 @@ class TouchDiffusionRecipe(Recipe):
 class TouchDiffusionObjective(nn.Module):
     """Denoising of touch latents, conditioned on one token: the embedding of the picture of the same contact.
 
-    Conditions are brought to `embedding_norm`, as in the pipeline. The class label is the sensor whose image is drawn.
-    `backgrounds` are latents (M, C, h, w) of what sensors see untouched, of which a batch names one for each sample.
+    Conditions are scaled to `embedding_norm`, as in the pipeline. The class label is the sensor whose image is drawn.
+    `backgrounds` are latents (M, C, h, w) of untouched sensors. A batch has the row of one for each sample.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class TouchDiffusionObjective(nn.Module):
         self.scheduler = scheduler
         self.embedding_norm = embedding_norm
         self.settings = settings
-        self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
+        self.backgrounds = backgrounds  # a buffer would be sent to all processes at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         latents = batch["latents"].float()
@@ -82,14 +82,13 @@ class TouchDiffusionObjective(nn.Module):
         return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
-        """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
+        """The network's conditions for each sample; unconditional where `kept` (B,) is false."""
         embeds = batch["image_embeds"].float()
-        settings = self.settings
         count, width = embeds.shape
-        device = embeds.device
-        size = settings.condition_noise * torch.rand(count, 1, device=device)
-        size = size * (torch.rand(count, 1, device=device) < settings.noisy_share)
-        noisy = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
+        noise_norm = self.settings.condition_noise * torch.rand(count, 1, device=embeds.device)
+        is_noisy = torch.rand(count, 1, device=embeds.device) < self.settings.noisy_share
+        noise = noise_norm * is_noisy * torch.randn_like(embeds) / width**0.5
+        noisy = match_norm(embeds, 1.0) + noise
         condition = match_norm(noisy, self.embedding_norm) * kept[:, None]
         conditions = {"encoder_hidden_states": condition[:, None], "class_labels": batch["sensor"]}
         if self.backgrounds is not None:
@@ -98,17 +97,25 @@ class TouchDiffusionObjective(nn.Module):
 
 
 def places_of(splits: Sequence[Contacts]) -> list[np.ndarray]:
-    """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
-    starts = np.cumsum([0, *(2 * -(-len(split) // GROUP) for split in splits)])
-    return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
+    """The row of each contact's first sensor among the untouched gels of all splits; its second sensor is the next row.
+
+    A split has two sensors for every `GROUP` contacts.
+    """
+    places = list[np.ndarray]()
+    start = 0
+    for split in splits:
+        places.append(start + np.arange(len(split)) // GROUP * 2)
+        start += 2 * math.ceil(len(split) / GROUP)
+    return places
 
 
 def inputs(
     stage: Stage, joint: UniTouchModel, vae: Autoencoder, sensors: Sequence[str], with_gels: bool
 ) -> tuple[ArrayDataset, Tensor | None]:
-    """Columns of latents of touches, embeddings of their pictures, sensors and, with gels, places of their backgrounds.
+    """Columns of touch latents, embeddings of their pictures, sensors and, with gels, rows of their backgrounds.
 
-    `sensors` are the names of the class labels. With gels, it also returns the latents (M, C, h, w) of all backgrounds.
+    `sensors` are the names of the class labels. With gels, the latents (M, C, h, w) of all backgrounds are returned,
+    too.
     """
     splits = stage.splits("image", "touch", "sensor")
     embeds = stage.image_embeddings(joint, splits)
@@ -118,17 +125,32 @@ def inputs(
     if not with_gels:
         return ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor), None
     gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in stage.sources)  # type: ignore[union-attr]
-    places = torch.from_numpy(np.concatenate(places_of(splits)))
-    # Each contact is learnt by its second sensor as well, which has no name.
-    images = [split.second for split in splits if split.second is not None]
-    seconds = cached_latents(stage, vae, f"second{size}", splits, images)
+    rows = torch.from_numpy(np.concatenate(places_of(splits)))
+    # Every contact is a sample under its second sensor, too. That sensor has no name.
+    second_touches = [split.second for split in splits if split.second is not None]
+    second_latents = cached_latents(stage, vae, f"second{size}", splits, second_touches)
     dataset = ArrayDataset(
-        latents=torch.cat([latents, seconds]),
+        latents=torch.cat([latents, second_latents]),
         image_embeds=torch.cat([embeds, embeds]),
         sensor=torch.cat([sensor, torch.full_like(sensor, len(sensors))]),
-        background=torch.cat([places, places + 1]),
+        background=torch.cat([rows, rows + 1]),
     )
     return dataset, cached_latents(stage, vae, f"untouched{size}", splits, gels)
+
+
+def check_unet(unet: UNet2DConditionModel, expected: dict[str, int | None]) -> None:
+    """Raises if the network is for other latents or another number of sensors than `expected`."""
+    wrong = {key: unet.config[key] for key in expected if unet.config[key] != expected[key]}
+    if wrong:
+        takes = f"for latents of `vae` and the sensors of `data` it takes {expected}"
+        raise InvalidInputError(f"The network has {wrong}; {takes}. Change `model`, or name another `init`.")
+
+
+def class_count(sensors: Sequence[str], with_gels: bool) -> int | None:
+    """The number of class labels: one for each named sensor and, with gels, one for all others; `None` for none."""
+    if not sensors:
+        return None
+    return len(sensors) + 1 if with_gels else len(sensors)
 
 
 def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:
@@ -137,25 +159,28 @@ def main(stage: Stage, recipe: TouchDiffusionRecipe) -> None:
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
     with_gels = stage.data.drawn is not None
-    classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
+    classes = class_count(sensors, with_gels)
+    in_channels = 2 * channels if with_gels else channels
     unet = stage.unet(recipe.model, num_class_embeds=classes)
-    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
-    if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
-        takes = f"for latents of `vae` and the sensors of `data` it takes {wanted}"
-        raise InvalidInputError(f"The network has {wrong}; {takes}. Change `model`, or name another `init`.")
+    check_unet(unet, {"num_class_embeds": classes, "in_channels": in_channels, "out_channels": channels})
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
 
-    dataset, table = inputs(stage, joint, vae, sensors, with_gels)
-    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, recipe.objective, table)
+    dataset, backgrounds = inputs(stage, joint, vae, sensors, with_gels)
+    objective = TouchDiffusionObjective(
+        unet, scheduler, joint.config.embedding_norm, settings=recipe.objective, backgrounds=backgrounds
+    )
     stage.fit(objective, dataset)
-    embeds: Any = dataset.columns["image_embeds"][: len(dataset) // (1 + with_gels)]  # those of first sensors
-    rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[: recipe.embedding_bank.size]
+    embeds: Any = dataset.columns["image_embeds"]
+    if with_gels:
+        embeds = embeds[: len(embeds) // 2]  # the second half repeats them for second sensors
+    chosen = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[: recipe.embedding_bank.size]
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
-        EmbeddingBank.of(embeds[rows]).save_pretrained(folder / "embedding_bank")
+        EmbeddingBank.of(embeds[chosen]).save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
-        if table is not None and sensors:
-            labels, places = (np.asarray(dataset.columns[name]) for name in ("sensor", "background"))
-            own = [int(places[labels == label][0]) for label in range(len(sensors))]
-            SensorBackgrounds.of(table[own]).save_pretrained(folder / "backgrounds")
+        if backgrounds is not None and sensors:
+            labels = np.asarray(dataset.columns["sensor"])
+            rows = np.asarray(dataset.columns["background"])
+            first_rows = [int(rows[labels == label][0]) for label in range(len(sensors))]
+            SensorBackgrounds.of(backgrounds[first_rows]).save_pretrained(folder / "backgrounds")

@@ -1,8 +1,7 @@
-"""Touch-LLM (Section 4.6 of the paper): a bridge from pictures' embeddings into a frozen LLaMA, for touches zero-shot.
+"""Touch-LLM (Section 4.6 of the paper): a bridge from image embeddings into a frozen LLaMA, for touches zero-shot.
 
-The stage `language_model` trains the tiny family's LLaMA from nothing, on what the world can be asked. It is so small,
-and reads so little, that a bridge into one that was trained on words alone hardly moves it. So it is trained with a
-bridge, which is discarded.
+The stage `language_model` trains the tiny family's LLaMA from random weights on questions about the world. A model so
+small, if trained on words alone, hardly attends to a bridge. So it is trained with a bridge, which is discarded.
 """
 
 import shutil
@@ -26,27 +25,27 @@ from unitouch_gen.weights import TOUCH_TO_TEXT
 from unitouch_gen.world.questions import TOPICS, answered
 
 PROMPT = "{question}\n"  # before an answer
-VARIANTS = 3  # of the wording of each topic
-Pairs = list[tuple[str, str]]
+VARIANTS = 3  # wordings of each topic
+Pairs = list[tuple[str, str]]  # questions and answers
 
 
 class AnswerSettings(Settings):
-    """What `AnswerObjective` does to embeddings."""
+    """Settings of `AnswerObjective`."""
 
-    noise: NonNegativeFloat  # greatest length of what is added to unit embeddings
+    noise: NonNegativeFloat  # largest norm of the noise on unit embeddings
 
 
 class TouchLLMRecipe(Recipe):
-    model: Arguments = {}  # of the LLaMA that `language_model` trains
-    bridge: Arguments  # of `LanguageBridge.for_model`
+    model: Arguments = {}  # arguments of the `LlamaConfig` of `language_model`
+    bridge: Arguments  # arguments of `LanguageBridge.for_model`
     objective: AnswerSettings
 
 
 class AnswerObjective(nn.Module):
-    """Cross-entropy of the answers' tokens of a bridge into a language model, which is frozen or is trained with it.
+    """Cross-entropy of the answers' tokens, by a bridge into a language model that is frozen or trained with it.
 
-    Unit embeddings get a random vector of up to the length `noise`, so that a bridge that was trained on pictures'
-    takes those of touches, which lie beside them (Nukrai et al., 2022, "Text-Only Training for Image Captioning using
+    Noise of up to the norm `noise` is added to unit embeddings. So a bridge trained on embeddings of pictures works on
+    those of touches, which lie beside them (Nukrai et al., 2022, "Text-Only Training for Image Captioning using
     Noise-Injected CLIP").
     """
 
@@ -62,49 +61,56 @@ class AnswerObjective(nn.Module):
         return self.bridge if self.frozen else self
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        rows = torch.arange(len(batch["input_ids"]))
-        chosen = torch.randint(batch["input_ids"].shape[1], (len(rows),))  # one of the pairs (B, V, T) of each contact
-        ids, labels = (batch[name][rows, chosen].long() for name in ("input_ids", "labels"))
-        longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # what is behind it is padding
+        count, pairs, _ = batch["input_ids"].shape
+        rows = torch.arange(count)
+        chosen = torch.randint(pairs, (count,))  # one question and answer of each contact
+        ids = batch["input_ids"][rows, chosen].long()
+        labels = batch["labels"][rows, chosen].long()
+        longest = int((labels != -100).any(dim=0).nonzero().max()) + 1  # only padding follows
         ids = ids[:, :longest]
         labels = labels[:, :longest]
         embeds = F.normalize(batch["image_embeds"].float(), dim=1)
-        embeds = embeds + self.noise * torch.rand_like(embeds[:, :1]) * F.normalize(torch.randn_like(embeds), dim=1)
+        noise_norm = self.noise * torch.rand_like(embeds[:, :1])
+        embeds = embeds + noise_norm * F.normalize(torch.randn_like(embeds), dim=1)
         with self.bridge.attach(self.language_model, embeds):
             return {"loss": self.language_model(input_ids=ids, labels=labels).loss}
 
 
 def pairs_of(sources: Sequence[Source], splits: Sequence[Contacts]) -> list[Pairs]:
-    """Questions and answers of each sample; of a data set's, its caption again and again."""
+    """Questions and answers of each sample. For a sample of a data set, every answer is its caption."""
     pairs = list[Pairs]()
     for source, split in zip(sources, splits, strict=True):
         if isinstance(source, DrawnContacts):
             draws = source.world().draw(*source.contacts("train"))
-            measured = split.attributes.mean(dim=1)
-            asked = [answered(draws, measured, variant) for variant in range(VARIANTS)]
-            pairs += [[pair for one in told for pair in one.values()] for told in zip(*asked, strict=True)]
+            attributes = split.attributes.mean(dim=1)
+            variants = [answered(draws, attributes, variant) for variant in range(VARIANTS)]
+            for by_variant in zip(*variants, strict=True):
+                pairs.append([pair for by_topic in by_variant for pair in by_topic.values()])
         else:
             questions = TOPICS["caption"].questions * len(TOPICS)
-            pairs += [[(question, caption) for question in questions] for caption in split.text]
+            for caption in split.text:
+                pairs.append([(question, caption) for question in questions])
     return pairs
 
 
 def encoded(tokenizer: PreTrainedTokenizerBase, pairs: Sequence[Pairs]) -> dict[str, Tensor]:
-    """Columns of token ids, and of labels, which are those of answers, int16 (N, V, T)."""
-    questions, answers = zip(*(pair for one in pairs for pair in one), strict=True)
-    prompts = [PROMPT.replace("{question}", question) for question in questions]
-    tokens = tokenizer(prompts, list(answers), padding=True, return_token_type_ids=True, return_tensors="pt")
+    """Columns of token ids and of labels, which are the ids of answers and -100 elsewhere, int16 (N, V, T)."""
+    flat = [pair for pairs_of_sample in pairs for pair in pairs_of_sample]
+    prompts = [PROMPT.replace("{question}", question) for question, _ in flat]
+    answers = [answer for _, answer in flat]
+    tokens = tokenizer(prompts, answers, padding=True, return_token_type_ids=True, return_tensors="pt")
     ids = tokens["input_ids"].short()
-    columns = {"input_ids": ids, "labels": ids.masked_fill(tokens["token_type_ids"] == 0, -100)}
+    labels = ids.masked_fill(tokens["token_type_ids"] == 0, -100)
+    columns = {"input_ids": ids, "labels": labels}
     return {name: column.view(len(pairs), -1, ids.shape[1]) for name, column in columns.items()}
 
 
 def main(stage: Stage, recipe: TouchLLMRecipe) -> None:
-    llama = stage.folders.get("llama")  # of `touch_llm` alone
+    llama = stage.folders.get("llama")  # only `touch_llm` has one
     if llama is not None and recipe.model:
         raise InvalidInputError("`model` is that of `--llama`; leave the section out.")
-    words = llama or TOUCH_TO_TEXT / "language_model"  # which knows every byte
-    tokenizer = read_tokenizer("llama", words, AutoTokenizer)
+    tokenizer_folder = llama or TOUCH_TO_TEXT / "language_model"  # the built-in tokenizer knows every byte
+    tokenizer = read_tokenizer("llama", tokenizer_folder, AutoTokenizer)
     if llama is not None:
         with reading("llama", llama):
             model = read_network(LlamaForCausalLM, llama, dtype=torch.float32)
@@ -113,10 +119,15 @@ def main(stage: Stage, recipe: TouchLLMRecipe) -> None:
     if llama is None:
         special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
         model = LlamaForCausalLM(build("model", LlamaConfig, recipe.model, vocab_size=len(tokenizer), **special))
-    given = {"language_model": model, "embedding_dim": joint.config.projection_dim}
-    bridge = build("bridge", LanguageBridge.for_model, recipe.bridge, **given)
-    pairs = encoded(tokenizer, pairs_of(stage.sources, splits))
-    dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **pairs)
+    bridge = build(
+        "bridge",
+        LanguageBridge.for_model,
+        recipe.bridge,
+        language_model=model,
+        embedding_dim=joint.config.projection_dim,
+    )
+    columns = encoded(tokenizer, pairs_of(stage.sources, splits))
+    dataset = ArrayDataset(image_embeds=stage.image_embeddings(joint, splits), **columns)
     stage.fit(AnswerObjective(model, bridge, recipe.objective.noise, frozen=llama is not None), dataset)
     with stage.saving() as folder:
         if llama is not None:

@@ -1,6 +1,6 @@
-"""Stage 5, pictures from image embeddings: an unCLIP UNet (Ramesh et al., 2022; Rombach et al., 2022).
+"""Pictures from image embeddings by unCLIP (Ramesh et al., 2022; Rombach et al., 2022).
 
-It is trained on image embeddings alone, so whatever else is bound to images can take their place.
+The model is trained on image embeddings alone. Embeddings of other modalities, bound to images, can take their place.
 """
 
 from typing import Any, Self
@@ -23,17 +23,17 @@ from unitouch_gen.training.stages import Recipe, Stage
 
 
 class UnclipSettings(Settings):
-    """What the conditions go through in training."""
+    """Dropout, prompts and noise of the conditions."""
 
     condition_dropout: Share  # probability of training a sample without embedding and prompt, for guidance
-    caption_share: Share  # probabilities of the caption and of no prompt; the others read "high quality"
-    empty_share: Share
-    clean_share: Share  # of the embeddings at noise level 0; the levels of the others are uniform
-    gain: Share  # lowest on the embedding; uniform up to 1, so that a strength below 1 is known in training
+    caption_share: Share  # probability of the caption as the prompt
+    empty_share: Share  # probability of an empty prompt; the remaining prompts are "high quality"
+    clean_share: Share  # share of embeddings at noise level 0; the levels of the others are uniform
+    gain: Share  # lowest scale of the embedding, uniform up to 1, so that a `strength` below 1 is seen in training
     step_power: StepPower
 
     @model_validator(mode="after")
-    def _prompts_are_at_most_all(self) -> Self:
+    def _check_shares(self) -> Self:
         if self.caption_share + self.empty_share > 1.0:
             raise InvalidInputError("`caption_share` and `empty_share` are more than 1 together; lower one.")
         return self
@@ -46,10 +46,10 @@ class UnclipRecipe(Recipe):
 
 
 class UnclipObjective(nn.Module):
-    """Denoising of latents, conditioned on an image embedding, noised by `normalizer` and `noising`, and a prompt.
+    """Denoising of latents, conditioned on a prompt and on an image embedding noised by `normalizer` and `noising`.
 
-    Prompts are some of the samples' captions. Of the frozen text encoder only the hidden states are used. `level` is
-    the noise level of embeddings; each sample draws one if it is left out.
+    `captions` are those of all samples; the frozen text encoder gives the hidden states of prompts. `level` is the
+    noise level of embeddings; if it is left out, each sample draws one.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class UnclipObjective(nn.Module):
         self.scheduler = scheduler
         self.settings = settings
         self.level = level
-        self.frozen = (normalizer, text_encoder.eval())  # in a tuple, so that they are no modules of the objective
+        self.frozen = (normalizer, text_encoder.eval())  # a tuple hides them from `modules()`
         self.noising = noising
         self.captions = captions
         self.processor = processor
@@ -82,32 +82,45 @@ class UnclipObjective(nn.Module):
         return {"loss": denoising_loss(self.trained, self.scheduler, latents, settings.step_power, **conditions)}
 
     def conditions(self, batch: Batch, kept: Tensor) -> dict[str, Tensor]:
-        """Conditions of each sample, as the network takes them; unconditional ones where `kept` (B,) is false."""
+        """The network's conditions for each sample; unconditional where `kept` (B,) is false."""
         embeds = batch["image_embeds"]
-        settings = self.settings
         count = len(embeds)
         device = embeds.device
-        if self.level is None:  # some are at level 0, where a picture's own embedding is used, the others at any level
-            noised = torch.rand(count, device=device) >= settings.clean_share
-            level = torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * noised
-        else:
-            level = torch.full((count,), self.level, device=device)
-        gain = settings.gain + (1.0 - settings.gain) * torch.rand(count, 1, device=device)
+        level = self._noise_levels(count, device)
+        lowest = self.settings.gain
+        gain = lowest + (1.0 - lowest) * torch.rand(count, 1, device=device)
         noise = torch.randn_like(embeds)
         labels = noise_embeddings(gain * embeds, level, noise, self.frozen[0], self.noising)  # (B, 2 D)
-        hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
-        return {"encoder_hidden_states": hidden, "class_labels": labels * kept[:, None]}
+        prompts = self._draw_prompts(batch["index"].tolist(), kept.tolist())
+        hidden_states = self._encode_prompts(prompts, device)
+        return {"encoder_hidden_states": hidden_states, "class_labels": labels * kept[:, None]}
+
+    def _noise_levels(self, count: int, device: torch.device) -> Tensor:
+        """Noise levels (B,) of embeddings: `level`; else 0, as for a picture's own embedding, or any level."""
+        if self.level is not None:
+            return torch.full((count,), self.level, device=device)
+        is_noisy = torch.rand(count, device=device) >= self.settings.clean_share
+        return torch.randint(0, self.noising.config.num_train_timesteps, (count,), device=device) * is_noisy
+
+    def _draw_prompts(self, index: list[int], kept: list[bool]) -> list[str]:
+        """A caption, "high quality" or nothing for each sample."""
+        prompts = list[str]()
+        for row, keep, draw in zip(index, kept, torch.rand(len(index)).tolist(), strict=True):
+            if not keep or draw > 1.0 - self.settings.empty_share:
+                prompts.append("")
+            elif draw < self.settings.caption_share:
+                prompts.append(self.captions[row])
+            else:
+                prompts.append(QUALITY_PROMPT)
+        return prompts
 
     @torch.no_grad()
-    def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
-        """Hidden states (B, L, width) of the prompts."""
-        prompts = []
-        for row, keep, draw in zip(index, kept, torch.rand(len(index)).tolist(), strict=True):
-            caption = self.captions[row] if draw < self.settings.caption_share else QUALITY_PROMPT
-            prompts.append("" if not keep or draw > 1.0 - self.settings.empty_share else caption)
+    def _encode_prompts(self, prompts: list[str], device: torch.device) -> Tensor:
+        """Hidden states (B, L, width) of prompts."""
         unique = list(dict.fromkeys(prompts))
-        text_encoder = self.frozen[1].to(device)  # accelerate moves only what is registered
-        hidden = text_encoder(self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
+        text_encoder = self.frozen[1].to(device)  # accelerate moves only modules of the objective
+        input_ids = self.processor.text(unique)["input_ids"].to(device)
+        hidden = text_encoder(input_ids).last_hidden_state
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
 
@@ -120,7 +133,7 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 
 
 def inputs(stage: Stage, joint: UniTouchModel, vae: Autoencoder) -> tuple[ArrayDataset, list[str]]:
-    """Columns of pictures' latents, embeddings and numbers, and the caption of each picture."""
+    """Columns of the pictures' latents, embeddings and indices, and the caption of each picture."""
     splits = stage.splits("image", "text")
     embeds = stage.image_embeddings(joint, splits)
     captions = [caption for split in splits for caption in split.text]
@@ -136,8 +149,16 @@ def main(stage: Stage, recipe: UnclipRecipe) -> None:
     embeds: Any = dataset.columns["image_embeds"]
     normalizer = fit_normalizer(embeds)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
-    texts = (captions, stage.processor, joint.text_model.text_model)
-    objective = UnclipObjective(unet, scheduler, recipe.objective, normalizer, noising, *texts)
+    objective = UnclipObjective(
+        unet,
+        scheduler,
+        settings=recipe.objective,
+        normalizer=normalizer,
+        noising=noising,
+        captions=captions,
+        processor=stage.processor,
+        text_encoder=joint.text_model.text_model,
+    )
     stage.fit(objective, dataset)
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
