@@ -1,4 +1,4 @@
-"""Work that is done once: columns that are decoded or rendered to files, and what is computed of them."""
+"""The cache of a stage: columns decoded or rendered to memory-mapped files, and tensors computed from them."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from unitouch_gen.training.data.sets import RecordSet
 
 
 def for_each(call: Callable[[int], object], data: RecordSet, quiet: bool = False) -> dict[int, str]:
-    """Calls with the number of each record, in threads, and returns why some cannot be read."""
+    """Calls with the number of each record, in threads. Returns reasons by the number of a record that failed."""
     broken: dict[int, str] = {}
 
     def call_one(row: int) -> None:
@@ -36,28 +36,33 @@ Arrays = dict[str, np.memmap]
 def mapped(
     folder: Path, count: int, columns: Mapping[str, tuple[Any, ...]], write: Callable[[Arrays, Path], None]
 ) -> Arrays:
-    """Arrays of `count` rows in the .npy files of a folder; `write` fills them where they are not there yet.
+    """Arrays of `count` rows in the .npy files of a folder. If they are missing, `write` fills them.
 
-    `columns` gives dtype and shape of a row by name. What `write` puts beside the arrays is kept with them.
+    `columns` has dtype and shape of a row by name. `write(arrays, folder)` may write other files beside the arrays.
     """
-    there = all((folder / f"{name}.npy").is_file() for name in columns)
-    if not there or is_unfinished(folder):
-        with filling("cache", folder) as place:
+    complete = all((folder / f"{name}.npy").is_file() for name in columns)
+    if not complete or is_unfinished(folder):
+        with filling("cache", folder) as partial:
             arrays: Arrays = {}
             for name, (dtype, *shape) in columns.items():
-                file = place / f"{name}.npy"
-                arrays[name] = np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=(count, *shape))
-                if hasattr(os, "posix_fallocate"):  # a disk that is found to be full later would end the process
-                    with file.open("r+b") as stream:
-                        os.posix_fallocate(stream.fileno(), 0, arrays[name].offset + arrays[name].nbytes)
-            write(arrays, place)
+                arrays[name] = _allocate(partial / f"{name}.npy", dtype, shape=(count, *shape))
+            write(arrays, partial)
             for array in arrays.values():
                 array.flush()
     return {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in columns}
 
 
+def _allocate(file: Path, dtype: Any, shape: tuple[int, ...]) -> np.memmap:
+    """A memory-mapped array whose space on the disk is reserved; writing to a full disk would kill the process."""
+    array = np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as stream:
+            os.posix_fallocate(stream.fileno(), 0, array.offset + array.nbytes)
+    return array
+
+
 def computed_once(file: Path, compute: Callable[[], Tensor]) -> Tensor:
-    """What `compute` gives; read from the file if it is there, else written to it."""
+    """The tensor in a file; if there is none, the result of `compute`, which is written to it."""
     if file.is_file():
         return load_file(file)["values"]
     values = compute()

@@ -1,7 +1,8 @@
-"""What stages are trained on: contacts of the built-in world and data sets, as arrays that are mapped into memory."""
+"""Training data of stages: contacts of the built-in world and of data sets, as memory-mapped arrays."""
 
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -19,9 +20,10 @@ from unitouch_gen.errors import InvalidInputError, check_file
 from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
+from unitouch_gen.models.sounds import LogMel
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Relit
-from unitouch_gen.training.data.records import Record, few
+from unitouch_gen.training.data.records import Record, abbreviate
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, MATERIAL_NAMES, SAMPLE_RATE
@@ -30,7 +32,7 @@ Source = DrawnContacts | RecordSet
 
 
 class SetConfig(Settings):
-    """A data set to train on: the arguments of `open_dataset`, and `split`, what keeps its training split apart."""
+    """A data set to train on: the arguments of `open_dataset`, and `split`, by what its splits are kept apart."""
 
     path: str
     kind: str = "auto"
@@ -40,31 +42,34 @@ class SetConfig(Settings):
 
 
 class DataConfig(Settings):
-    """What a stage is trained on: data sets or the built-in world."""
+    """Training data of a stage: data sets or the built-in world."""
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None  # contacts of the world
-    image_size: int | None = None  # side of the pictures, pixels, where no joint space says it
+    image_size: int | None = None  # side of the pictures, pixels; a joint space has its own
     touch_size: Annotated[int, Field(ge=8)] | None = None  # side of the touches, pixels; `image_size` if left out
-    audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
+    audio: dict[str, Any] | None = None  # fields of `LogMel`, the paper's if left out; a joint space has its own
 
     def sources(self) -> list[Source]:
-        """All there is to train on, yet to be rendered or decoded: contacts or data sets of one sensor each."""
+        """All sources of training data, not yet rendered or decoded, each of one sensor."""
         if (self.drawn is None) == (not self.sets):
             raise InvalidInputError("`data` takes one of the two: `sets`, as [{path: FOLDER}], or `drawn`.")
         sources: list[Source] = [*self.drawn.sources()] if self.drawn else []
-        for one in self.sets:
-            data = open_dataset(one.path, **one.model_dump(exclude={"path", "split"}))
-            sources += data.split("train", one.split).by_sensor()
+        for config in self.sets:
+            data = open_dataset(config.path, **config.model_dump(exclude={"path", "split"}))
+            sources += data.split("train", config.split).by_sensor()
         return sources
 
 
-FIELDS = {"image": "picture", "gel": "background", "audio": "sound", "text": "caption"}  # in a record
+FIELDS = {"image": "picture", "gel": "background", "audio": "sound", "text": "caption"}
+"""Fields of a record by the names of columns; `touch` and `sensor` are the same."""
+
+ColumnKind = tuple[Any, ...]  # dtype, then shape of a row
 
 
-def has(record: Record, need: str) -> bool:
+def has(record: Record, column: str) -> bool:
     """Whether a record has a column that a stage may need: touch, image, gel, audio, text, sensor."""
-    return getattr(record, FIELDS.get(need, need)) is not None
+    return getattr(record, FIELDS.get(column, column)) is not None
 
 
 def columns_of(
@@ -76,14 +81,14 @@ def columns_of(
 ) -> list[Contacts]:
     """The columns of each source to train on, rendered or decoded if the cache does not hold them yet.
 
-    `needs` are those of `has`; other columns of data sets stay empty. Raises `InvalidInputError` if a data set lacks
-    what is needed, or files cannot be read.
+    `needs` are names of columns, see `has`. Other columns of data sets stay empty.
+
+    Raises:
+        InvalidInputError: If a data set lacks a column, or files cannot be read.
     """
-    for data in (source for source in sources if isinstance(source, RecordSet)):
-        lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if not has(r, need)]
-        if lacking or len(data) < 2:
-            wrong = f"no {few(lacking)}" if lacking else "a single record, where two are the least"
-            raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
+    for source in sources:
+        if isinstance(source, RecordSet):
+            check_columns(source, needs)
     if config.drawn is not None and config.drawn.colours_alone and "touch" in needs:
         raise InvalidInputError(
             "`data.drawn.colours_alone` is true, but this stage needs touches, and surfaces without heights feel flat; "
@@ -91,12 +96,21 @@ def columns_of(
         )
     if config.touch_size not in (None, processor.image_size) and config.drawn is not None:
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
-    return [
-        decoded(cache, source, processor, needs, config.touch_size)
-        if isinstance(source, RecordSet)
-        else drawn(cache, source, "train", processor)
-        for source in sources
-    ]
+    columns = list[Contacts]()
+    for source in sources:
+        if isinstance(source, RecordSet):
+            columns.append(decoded(cache, source, processor, needs, config.touch_size))
+        else:
+            columns.append(drawn(cache, source, "train", processor))
+    return columns
+
+
+def check_columns(data: RecordSet, needs: Sequence[str]) -> None:
+    """Raises if a record of a data set lacks a column, or there is only one record."""
+    lacking = [f"{column} for {record.id!r}" for column in needs for record in data.records if not has(record, column)]
+    if lacking or len(data) < 2:
+        wrong = f"no {abbreviate(lacking)}" if lacking else "a single record, where two are the least"
+        raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
 
 
 def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Contacts:
@@ -104,32 +118,33 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
     material, number, _ = source.contacts(split)
     size = processor.image_size
     mel = processor.audio
-    fingerprint = f"{source.fingerprint(split)}-{size}-{hashlib.sha256(str(mel).encode()).hexdigest()[:8]}"
+    mel_hash = hashlib.sha256(str(mel).encode()).hexdigest()
+    fingerprint = f"{source.fingerprint(split)}-{size}-{mel_hash[:8]}"
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
-    columns: dict[str, tuple[Any, ...]] = {
+    columns: dict[str, ColumnKind] = {
         **dict.fromkeys(("image", "touch", "second"), (np.uint8, 3, size, size)),
         "audio": (np.float16, 1, mel.mel_bins, mel.frames),
         "attributes": (np.float32, 2, len(ATTRIBUTES)),
         "maps": (np.float16, 2, len(MAPS), CELLS, CELLS),
     }
 
-    def write(arrays: Arrays, place: Path) -> None:
+    def write(arrays: Arrays, folder: Path) -> None:
         text = list[str]()
-        for scene, seen in tqdm(source.scenes(split, size), source.name, -(-len(material) // GROUP), mininterval=5):
-            first, second = seen["touch"].unbind(dim=1)
-            clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0]
-            made = {
+        scenes = source.scenes(split, size)
+        for scene, of_sensors in tqdm(scenes, source.name, total=math.ceil(len(material) / GROUP), mininterval=5):
+            first, second = of_sensors["touch"].unbind(dim=1)
+            rows = {
                 "image": as_bytes(scene.image),
                 "touch": as_bytes(first),
                 "second": as_bytes(second),
-                "audio": clips,
-                "attributes": seen["attributes"],
-                "maps": seen["maps"],
+                "audio": processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0],
+                "attributes": of_sensors["attributes"],
+                "maps": of_sensors["maps"],
             }
-            for name, values in made.items():
+            for name, values in rows.items():
                 arrays[name][len(text) : len(text) + len(values)] = values
             text += scene.text
-        (place / "text.json").write_text(json.dumps(text))
+        (folder / "text.json").write_text(json.dumps(text))
 
     arrays: Any = mapped(folder, len(material), columns, write)
     arrays["attributes"] = torch.from_numpy(np.array(arrays["attributes"]))
@@ -144,29 +159,32 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
     )
 
 
-def relit(cache: Path, source: DrawnContacts, split: str, seen: Contacts) -> np.ndarray:
-    """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), once into the cache."""
+def relit(cache: Path, source: DrawnContacts, split: str, contacts: Contacts) -> np.ndarray:
+    """The pictures of a rendered split under other lamps, uint8 (N, 3, S, S), rendered once into the cache."""
 
     def write(arrays: Arrays, _: Path) -> None:
-        scenes = source.rendered(split, seen.image.shape[-1], "image", kind=Relit)
+        scenes = source.rendered(split, contacts.image.shape[-1], "image", kind=Relit)
         for group, (scene, _) in enumerate(tqdm(scenes, f"{source.name}, relit", mininterval=5)):
-            arrays["image"][GROUP * group :][:GROUP] = as_bytes(scene.image)
+            start = GROUP * group
+            arrays["image"][start : start + GROUP] = as_bytes(scene.image)
 
-    folder = Path(cache) / f"{source.name}-{split}-relit-{seen.fingerprint}"
-    return mapped(folder, len(seen), {"image": (np.uint8, *seen.image.shape[1:])}, write)["image"]
+    folder = Path(cache) / f"{source.name}-{split}-relit-{contacts.fingerprint}"
+    columns: dict[str, ColumnKind] = {"image": (np.uint8, *contacts.image.shape[1:])}
+    return mapped(folder, len(contacts), columns, write)["image"]
 
 
 def decoded(
     cache: Path, data: RecordSet, processor: UniTouchProcessor, needs: Sequence[str], touch_size: int | None = None
 ) -> Contacts:
-    """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
+    """Decodes the columns `needs` of a data set of one sensor, if the cache does not hold them yet, and opens them.
 
-    Files that cannot be read are refused in a list, and leave nothing in the cache.
+    Raises:
+        InvalidInputError: If files cannot be read. Nothing is left in the cache.
     """
     size = processor.image_size
     mel = processor.audio
     side = touch_size or size
-    kinds: dict[str, tuple[Any, ...]] = {
+    kinds: dict[str, ColumnKind] = {
         "image": (np.uint8, 3, size, size),
         **dict.fromkeys(("touch", "gel"), (np.uint8, 3, side, side)),
         "audio": (np.float16, 1, mel.mel_bins, mel.frames),
@@ -183,21 +201,20 @@ def decoded(
             else:
                 rows[row] = as_bytes(centre_rectangle(value.read(), *rows.shape[2:]))
 
-        if broken := for_each(decode_row, data):
-            reasons = few([*broken.values()])
+        broken = for_each(decode_row, data)
+        if broken:
+            reasons = abbreviate([*broken.values()])
             raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
 
-    files = {file: os.stat(file) for record in data.records for file in record.files}
-    states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
-    state = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
-    fingerprint = hashlib.sha256(state.encode()).hexdigest()[:16]
+    fingerprint = fingerprint_of(data, size, side, mel)
+    safe_name = re.sub(r"[^A-Za-z0-9_-]+", "_", data.name)
     columns: dict[str, Any] = dict.fromkeys(kinds)
     for name, kind in kinds.items():
         if name in needs:
-            folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
+            folder = Path(cache) / f"{safe_name}-{name}-{fingerprint}"
             columns[name] = mapped(folder, len(data), {"values": kind}, partial(decode, name))["values"]
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
-    objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
+    _, objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)
     return Contacts(
         **columns,
         sensors=[record.sensor for record in data.records],
@@ -209,6 +226,14 @@ def decoded(
     )
 
 
+def fingerprint_of(data: RecordSet, size: int, side: int, mel: LogMel) -> str:
+    """A hash of the records, of the size and time of their files, and of the sizes they are decoded to."""
+    stats = {file: os.stat(file) for record in data.records for file in record.files}
+    states = [f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in sorted(stats.items())]
+    state = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
+    return hashlib.sha256(state.encode()).hexdigest()[:16]
+
+
 def as_bytes(pixels: Tensor) -> np.ndarray:
     """Pixels in [0, 1] as uint8."""
     return (pixels * 255).round().byte().numpy()
@@ -218,10 +243,12 @@ def sound_of(record: Record, data: RecordSet) -> Any:
     """A record's sound as processors take it: its file, or samples and their rate."""
     file = str(record.sound)
     check_file("sound", file, "a sound file")
-    return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
+    if file.endswith(".npy"):
+        return np.load(file, allow_pickle=False), data.sampling_rate
+    return file
 
 
 def sensor_numbers(splits: Sequence[Contacts], names: Sequence[str], unnamed: int = -1) -> np.ndarray:
-    """The place of each sample's sensor in `names`, int64 (N,); `unnamed` where it has none."""
+    """The index of each sample's sensor in `names`, int64 (N,); `unnamed` if it is not among them."""
     numbers: dict[str | None, int] = {name: number for number, name in enumerate(names)}
     return np.array([numbers.get(sensor, unnamed) for split in splits for sensor in split.sensors])

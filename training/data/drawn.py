@@ -1,7 +1,11 @@
-"""Contacts of the world, each under two sensors that see about as much of it: drawn anew, or the first by name."""
+"""Contacts of the world as training data, each under a pair of sensors with about the same field of view.
+
+The first sensor of a pair is a named one, or drawn at random like the second.
+"""
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -21,10 +25,11 @@ from unitouch_gen.world.scans import COLLECTION, scanned_surfaces
 from unitouch_gen.world.sensors import draw_sensor
 
 GROUP = 16  # contacts to a pair of sensors
+RENDERED = ("touch", "depth", "audio", "attributes", "image", "text")  # modalities that stages are trained on
 
 
 class Relit(World):
-    """The same contacts, each under the lamp and white balance of the next one, in other photos."""
+    """The same contacts, each in another photo, under the lamp and white balance of the next contact."""
 
     take = 1
 
@@ -35,19 +40,18 @@ class Relit(World):
 
 @dataclass(frozen=True)
 class DrawnContacts:
-    """What to render for one sensor: the first of each pair, or `None` where both are drawn anew; see `DrawnConfig`.
+    """Contacts to render for one sensor. With `scanned` at 1, materials without scanned surfaces are left out.
 
-    Objects are numbered from `number` thousands, so that no two sources share one. With `scanned` at 1, materials
-    without scanned surfaces are left out.
+    The last four fields are arguments of `World`.
     """
 
-    number: int
-    sensor: str | None
-    objects: int
+    number: int  # of the source; its objects are numbered from 1000 `number`, so that no two sources share one
+    sensor: str | None  # the first sensor of each pair; `None` draws one for each pair
+    objects: int  # of each material
     contacts_per_object: int
     seed: int = 0
-    held_out: int = 16  # objects of the other splits
-    scanned: float = 0.0  # these are arguments of `World`
+    held_out: int = 16  # objects of each material in the other splits
+    scanned: float = 0.0
     photographic: float = 0.0
     recordings: float = 0.0
     colours_alone: bool = False
@@ -57,7 +61,7 @@ class DrawnContacts:
         return f"drawn-{self.sensor or 'any'}"
 
     def world(self, size: int = 128, kind: type[World] = World) -> World:
-        """The world that contacts are of, which renders images of a size."""
+        """The world of these contacts, which renders images of side `size`."""
         return kind(
             self.seed,
             image_size=size,
@@ -68,76 +72,93 @@ class DrawnContacts:
         )
 
     def contacts(self, split: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Material, object and contact, int64 (N,), in an order in which neighbours have nothing in common."""
+        """Numbers of material, object and contact, int64 (N,), in random order."""
         first = 1000 * self.number + FIRST_OBJECT[split]
         count = self.objects if split == "train" else self.held_out
         contacts = {"train": self.contacts_per_object, "val": 2, "test": 5, "beyond": 5}[split]
-        ranges = (range(len(MATERIAL_NAMES)), range(first, first + count), range(contacts))
-        grid = torch.cartesian_prod(*map(torch.tensor, ranges))
+        grid = torch.cartesian_prod(
+            torch.arange(len(MATERIAL_NAMES)),
+            torch.arange(first, first + count),
+            torch.arange(contacts),
+        )
         if self.scanned == 1.0:
-            grid = grid[self.world().draw(*grid.unbind(1)).surface >= 0]
+            is_scanned = self.world().draw(*grid.unbind(1)).surface >= 0
+            grid = grid[is_scanned]
         order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
         return grid[order, 0], grid[order, 1], grid[order, 2]
 
     def pair(self, split: str, group: int) -> tuple[Sensor, Sensor]:
         """The sensors of contacts 16 `group` to 16 `group` + 15."""
-        number = 2 * group + 10**6 * (len(FIRST_OBJECT) * self.number + list(FIRST_OBJECT).index(split))
+        split_number = len(FIRST_OBJECT) * self.number + list(FIRST_OBJECT).index(split)
+        number = 10**6 * split_number + 2 * group
         first = draw_sensor(self.seed, number) if self.sensor is None else SENSORS[self.sensor]
-        return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
+        second = draw_sensor(self.seed, number + 1, near=first.field_of_view)
+        return first, second
 
     def rendered(
         self, split: str, size: int, *modalities: str, kind: type[World] = World
     ) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
-        """Scenes of sixteen contacts each, with what was asked for, and their pairs of sensors."""
+        """Scenes of sixteen contacts each, with some modalities, and their pairs of sensors."""
         world = self.world(size, kind)
-        for group, names in enumerate(zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True)):
+        material, object_, contact = (numbers.split(GROUP) for numbers in self.contacts(split))
+        for group, contacts in enumerate(zip(material, object_, contact, strict=True)):
             sensors = self.pair(split, group)
-            yield world.render(*names, modalities=modalities, sensors=sensors), sensors
+            yield world.render(*contacts, modalities=modalities, sensors=sensors), sensors
 
     def scenes(self, split: str, size: int) -> Iterator[tuple[Any, dict[str, Tensor]]]:
         """Scenes, with touch (n, 2, 3, S, S), attributes (n, 2, 13) and maps (n, 2, 4, 8, 8) of both sensors."""
-        for scene, sensors in self.rendered(split, size, "touch", "depth", "audio", "attributes", "image", "text"):
-            seen = {
+        for scene, sensors in self.rendered(split, size, *RENDERED):
+            by_sensor = {
                 "touch": [scene.touch[sensor.name] for sensor in sensors],
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
-            yield scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+            yield scene, {name: torch.stack(pair, dim=1) for name, pair in by_sensor.items()}
 
     def untouched(self, split: str, size: int) -> Tensor:
-        """What the pair of sensors of each of G groups sees where nothing touches it, (G, 2, 3, S, S) in [0, 1]."""
-        groups = range(-(-len(self.contacts(split)[0]) // GROUP))
-        pairs = [self.pair(split, group) for group in groups]
-        return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
+        """Untouched images of both sensors of each of G groups, (G, 2, 3, S, S) in [0, 1]."""
+        material, _, _ = self.contacts(split)
+        pairs = list[Tensor]()
+        for group in range(math.ceil(len(material) / GROUP)):
+            first, second = self.pair(split, group)
+            pairs.append(torch.stack([untouched_gel(first, size), untouched_gel(second, size)]))
+        return torch.stack(pairs)
 
     def captions(self, variants: int) -> list[list[str]]:
-        """As many captions of each contact to train on as asked for, the first of them that of its scene."""
+        """Captions of each training contact in `variants` wordings, the first of them that of its scene."""
         draws = self.world().draw(*self.contacts("train"))
-        return [list(texts) for texts in zip(*(described(draws, one) for one in range(variants)), strict=True)]
+        by_variant = [described(draws, variant) for variant in range(variants)]
+        return [list(captions) for captions in zip(*by_variant, strict=True)]
 
     def surfaces(self, split: str) -> list[str | None]:
-        """Names of the scanned surfaces of each contact; `None` of those that are drawn."""
+        """The name of each contact's scanned surface; `None` if its surface is drawn."""
         numbers = self.world().draw(*self.contacts(split)).surface.tolist()
         return [scanned_surfaces()[number].name if number >= 0 else None for number in numbers]
 
     def fingerprint(self, split: str) -> str:
-        """Sixteen hexadecimal digits that change when what is rendered does: of names and some contacts."""
-        asked = [self.number, self.sensor, self.objects, self.contacts_per_object, self.seed]
-        # `None` stands where folders of scanned materials once did: what was cached then is found.
-        digest = hashlib.sha256(json.dumps([split, *asked, None, self.held_out]).encode())
+        """Sixteen hexadecimal digits, a hash of the settings and of the first rendered contacts."""
+        numbers = [self.number, self.sensor, self.objects, self.contacts_per_object, self.seed]
+        # `None` is in the place of a removed setting, so that older caches stay valid.
+        digest = hashlib.sha256(json.dumps([split, *numbers, None, self.held_out]).encode())
         if self.scanned or self.photographic or self.recordings:
-            digest.update(json.dumps([self.scanned, self.photographic, self.recordings, self.colours_alone]).encode())
+            shares = [self.scanned, self.photographic, self.recordings, self.colours_alone]
+            digest.update(json.dumps(shares).encode())
             digest.update((COLLECTION / "index.csv").read_bytes())
-        scene, seen = next(self.scenes(split, 32))
+        scene, of_sensors = next(self.scenes(split, 32))
         digest.update("\n".join(scene.text).encode())
-        measured = ((seen[name], 1000) for name in ("attributes", "maps"))
-        for values, levels in ((scene.image, 255), (seen["touch"], 255), (scene.audio, 32767), *measured):
+        for values, levels in (
+            (scene.image, 255),
+            (of_sensors["touch"], 255),
+            (scene.audio, 32767),
+            (of_sensors["attributes"], 1000),
+            (of_sensors["maps"], 1000),
+        ):
             digest.update((values * levels).round().int().numpy().tobytes())
         return digest.hexdigest()[:16]
 
     @property
     def summary(self) -> dict[str, object]:
-        """What a training run keeps on record of it."""
+        """The entry of this source in the record of a training run."""
         return {
             "name": self.name,
             "objects": self.objects,
@@ -152,19 +173,19 @@ SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", 
 
 
 class DrawnConfig(Settings):
-    """What to render of the world."""
+    """Contacts of the world to render."""
 
-    # Each by name has tokens of its own; null is for drawn ones.
+    # Each named sensor has tokens of its own; null draws a sensor for every 16 contacts.
     sensors: Annotated[list[SensorName | None], Field(min_length=1)] = [None]
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of the world
-    scanned: Share = 0.0  # of the objects, where their material has scanned surfaces
-    photographic: Share = 0.0  # of pictures, which are taken as people take photos
-    recordings: Share = 0.0  # of the sounds, which are recorded hits where their material has some
-    colours_alone: bool = False  # whether scans without heights are among them: for stages that see no touch
+    scanned: Share = 0.0  # share of scanned objects, of materials that have scanned surfaces
+    photographic: Share = 0.0  # share of pictures that are photos as people take them
+    recordings: Share = 0.0  # share of recorded sounds, of materials that have recordings
+    colours_alone: bool = False  # also scans without heights, for stages that use no touch
 
     def sources(self) -> list[DrawnContacts]:
-        """One for each sensor."""
+        """The contacts of each sensor."""
         settings = self.model_dump(exclude={"sensors"})
         return [DrawnContacts(number, sensor, **settings) for number, sensor in enumerate(self.sensors)]

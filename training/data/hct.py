@@ -9,34 +9,34 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.files import read_table
-from unitouch_gen.training.data.records import Frame, Record, column_of, found, frame_at
+from unitouch_gen.training.data.records import Frame, Record, column_of, find_paths, frame_at
 
 LOOKS_LIKE = ("data*/train.csv", "data*/test.csv")
-COLUMNS = (
-    ("url", "vision", "image", "rgb"),
-    ("tactile", "touch"),
-    ("tactile_background", "background"),
-    ("caption", "text"),
-)
-"""What releases call the columns of picture, touch, background and caption."""
+COLUMNS = {
+    "picture": ("url", "vision", "image", "rgb"),
+    "touch": ("tactile", "touch"),
+    "background": ("tactile_background", "background"),
+    "caption": ("caption", "text"),
+}
+"""Names of columns in the releases."""
 
 
 def read(folder: Path) -> Iterator[Record]:
-    """Its touches."""
-    for file in found(folder, *LOOKS_LIKE):
+    """A record for each row of the tables."""
+    for file in find_paths(folder, *LOOKS_LIKE):
         rows = read_table(file)
         base = file.parent
-        columns = [column_of(file, rows[0], names) for names in COLUMNS]
+        columns = {name: column_of(file, rows[0], alternatives) for name, alternatives in COLUMNS.items()}
         for row in rows:
-            picture, touch, background, caption = (row[column] for column in columns)
-            gel = frame_at(base / background) or frame_at((base / background).parents[2] / "digit_background.png")
+            touch = row[columns["touch"]]
+            background = base / row[columns["background"]]
             yield Record(
                 f"{base.name}/{touch}",
-                Frame(str(base / touch)),
-                Frame(str(base / picture)),
-                gel,
+                touch=Frame(str(base / touch)),
+                picture=Frame(str(base / row[columns["picture"]])),
+                background=frame_at(background) or frame_at(background.parents[2] / "digit_background.png"),
                 sensor="digit",
                 recording=f"{base.name}/{Path(touch).parts[0]}",
-                caption=caption or None,
+                caption=row[columns["caption"]] or None,
                 split=file.stem,
             )

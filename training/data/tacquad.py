@@ -13,7 +13,7 @@ from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_table
-from unitouch_gen.training.data.records import Frame, Record, found, images_in
+from unitouch_gen.training.data.records import Frame, Record, find_paths, images_in
 
 LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}  # by their folders
@@ -22,16 +22,19 @@ HEADER = ("item", *(f"{sensor}_{end}" for sensor in SENSORS for end in ("start",
 
 def read(folder: Path) -> Iterator[Record]:
     """The frames of all contacts."""
-    for table in found(folder, *LOOKS_LIKE):
+    for table in find_paths(folder, *LOOKS_LIKE):
         for row in read_table(table, HEADER):
+            if row["item"] == "item":  # some copies have a header
+                continue
             item = folder / table.stem.replace("contact", "data") / row["item"]
-            for sensor in SENSORS if row["item"] != "item" else ():  # some copies have a header
+            for sensor in SENSORS:
                 yield from contact(item, sensor, int(row[f"{sensor}_start"]), int(row[f"{sensor}_end"]))
 
 
 def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
     """The frames of one sensor's contact."""
-    touches, pictures = ([Frame(str(image)) for image in images_in(item / f"{of}{sensor}")] for of in ("", "img_"))
+    touches = [Frame(str(image)) for image in images_in(item / sensor)]
+    pictures = [Frame(str(image)) for image in images_in(item / f"img_{sensor}")]
     if not 0 <= start <= end < len(touches):
         raise InvalidInputError(f"{str(item / sensor)!r} has {len(touches)} images, but contact from {start} to {end}.")
     recording = f"{item.parent.name}/{item.name}/{sensor}"
@@ -40,9 +43,9 @@ def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
         picture = pictures[number * len(pictures) // len(touches)] if pictures else None
         yield Record(
             f"{recording}/{number}",
-            touches[number],
-            picture,
-            gel,
+            touch=touches[number],
+            picture=picture,
+            background=gel,
             sensor=SENSORS[sensor],
             object=item.name,
             recording=recording,

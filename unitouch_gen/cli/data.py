@@ -27,7 +27,7 @@ def check(
     from unitouch_gen.training.data import open_dataset
     from unitouch_gen.training.data.cache import for_each
     from unitouch_gen.training.data.columns import sound_of
-    from unitouch_gen.training.data.records import few
+    from unitouch_gen.training.data.records import abbreviate
 
     data = open_dataset(path, kind, sensor=sensor, materials=by_comma(materials))
     same = defaultdict[bytes, list[int]](list)  # records by their touches
@@ -56,10 +56,10 @@ def check(
             lines.append(f"{shared} of {len(splits)} {what}s are in more than one of its own splits")
     if broken:
         reasons = [f"{data.records[row].id}: {why}" for row, why in broken.items()]
-        lines.append(f"{len(broken)} of {len(data)} records cannot be read: {few(reasons)}")
+        lines.append(f"{len(broken)} of {len(data)} records cannot be read: {abbreviate(reasons)}")
     if twice := sorted(sorted(rows) for rows in same.values() if len(rows) > 1):
         equal = [" = ".join(data.records[row].id for row in rows) for rows in twice]
-        lines.append(f"{len(twice)} of {len(data)} touches are there more than once: {few(equal)}")
+        lines.append(f"{len(twice)} of {len(data)} touches are there more than once: {abbreviate(equal)}")
     print_table([data.name, data.kind, "records"], [[*kind, str(count)] for kind, count in sorted(counts.items())])
     echo("\n".join(lines or ["Nothing is wrong with it"]))
     raise Exit(1 if broken else 0)
