@@ -1,6 +1,6 @@
 """The joint space of touch, image, text and audio.
 
-Importing it lets `AutoConfig`, `AutoModel` and `AutoProcessor` of transformers know of it.
+Importing this package registers it with `AutoConfig`, `AutoModel` and `AutoProcessor` of transformers.
 """
 
 from transformers import AutoConfig, AutoModel, AutoProcessor

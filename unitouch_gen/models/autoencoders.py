@@ -1,8 +1,9 @@
-"""Between pixels and the latents of denoising networks: one convention over diffusers' autoencoders.
+"""Pixels to scaled latents and back, by any of diffusers' autoencoders.
 
 Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G).
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -24,8 +25,9 @@ def autoencoder_class(argument: str, name: Any) -> Any:
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:
-    """The autoencoder that a stage left in a folder, in evaluation mode and frozen."""
-    kind = autoencoder_class("vae", read_settings("vae", folder / "config.json").get("_class_name"))
+    """The autoencoder in a folder, frozen and in evaluation mode."""
+    settings = read_settings("vae", folder / "config.json")
+    kind = autoencoder_class("vae", settings.get("_class_name"))
     return read_network(kind, folder).requires_grad_(False)
 
 
@@ -35,7 +37,7 @@ def scale_factor(vae: Autoencoder) -> int:
 
 
 def encode_raw(vae: Autoencoder, pixels: Tensor) -> Tensor:
-    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them; of a KL model the mode."""
+    """Pixels (B, 3, H, W) in [-1, 1] -> unscaled latents (B, C, h, w); the mode of an `AutoencoderKL`."""
     output = vae.encode(pixels)
     return output.latent_dist.mode() if isinstance(vae, AutoencoderKL) else output[0]
 
@@ -49,8 +51,10 @@ def encode(vae: Autoencoder, pixels: Tensor) -> Tensor:
 def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
     """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
     raw = (latents / vae.config.scaling_factor + _shift(vae)).to(vae.dtype)
-    # On a CPU, channels-last convolutions take two thirds of the time, and parts of 8 stay in its caches.
-    parts = raw.to(memory_format=torch.channels_last).split(8) if raw.device.type == "cpu" else [raw]
+    parts: Sequence[Tensor] = [raw]
+    if raw.device.type == "cpu":
+        # Channels-last convolutions take two thirds of the time, and 8 images fit in the cache.
+        parts = raw.to(memory_format=torch.channels_last).split(8)
     pixels = torch.cat([vae.decode(part, return_dict=False)[0].float() for part in parts])
     return pixels.contiguous()  # users may call `view`
 

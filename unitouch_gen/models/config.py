@@ -1,6 +1,6 @@
-"""Configurations of the joint space, whose defaults are the paper's size.
+"""Configurations of the joint space; the defaults are the paper's sizes.
 
-A value of a wrong type is an `InvalidTypeError`; one out of range, or that does not fit the others, an
+A value of a wrong type raises `InvalidTypeError`. A value out of range, or one that does not fit the others, raises
 `InvalidInputError`.
 """
 
@@ -26,7 +26,7 @@ from unitouch_gen.saving import saved_whole
 
 
 def check_halved(patch_size: int, *lengths: int) -> None:
-    """Checks that a stem of convolutions can halve images of these sides down to patches."""
+    """Raises if a stem of convolutions cannot halve images of these sides down to patches."""
     if patch_size & (patch_size - 1) or any(length % patch_size for length in lengths):
         raise InvalidInputError(
             f"`patch_size` is {patch_size}; with a stem of convolutions it has to be a power of two that divides "
@@ -34,9 +34,9 @@ def check_halved(patch_size: int, *lengths: int) -> None:
         )
 
 
-def check_spelling(kind: type, given: Iterable[str]) -> None:
-    """Refuses a misspelt field, which transformers would keep as an attribute that nothing reads."""
-    for name in given:
+def check_spelling(kind: type, names: Iterable[str]) -> None:
+    """Raises for a misspelt field. transformers would keep it as an attribute that nothing reads."""
+    for name in names:
         hint = did_you_mean(name, kind.__dataclass_fields__)  # type: ignore[attr-defined]
         if hint and not hasattr(kind, name):
             raise InvalidInputError(f"`{name}` is no setting of {kind.__name__}. {hint}")
@@ -54,11 +54,12 @@ class UniTouchViTConfig(PreTrainedConfig):
             these on a touch and the relief behind it (`models.relief`), which sensors share.
         stem_norm: LayerNorm after the stem (eps 1e-5), as in ImageBind's audio trunk.
         add_bias_kv: One learned key and value appended to every sequence.
-        layer_norm_eps: Of all other norms.
+        layer_norm_eps: epsilon of all other norms.
         projection_dim: Width D of the joint space.
-        patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
-        texture_width: Hidden units of what a network trained on photos adds to the embedding; 0 adds nothing (ViT). See
-            `models.texture`.
+        patch_channels: Channels per patch of a position-wise head that is added to the class embedding; 0 for none
+            (ViT).
+        texture_width: Hidden units of the texture head (`models.texture`) that is added to the embedding; 0 for none
+            (ViT).
     """
 
     model_type = "unitouch_vit"
@@ -83,18 +84,15 @@ class UniTouchViTConfig(PreTrainedConfig):
     def __post_init__(self, **kwargs: Any) -> None:
         check_spelling(UniTouchViTConfig, kwargs)
         super().__post_init__(**kwargs)
-        for name in (
-            "hidden_size",
-            "num_hidden_layers",
-            "num_attention_heads",
-            "num_channels",
-            "patch_size",
-            "patch_stride",
-            "projection_dim",
-            "image_height",
-            "image_width",
-        ):
-            check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
+        check_integer("hidden_size", self.hidden_size, 1)
+        check_integer("num_hidden_layers", self.num_hidden_layers, 1)
+        check_integer("num_attention_heads", self.num_attention_heads, 1)
+        check_integer("num_channels", self.num_channels, 1)
+        check_integer("patch_size", self.patch_size, 1)
+        check_integer("patch_stride", self.patch_stride, 1)
+        check_integer("projection_dim", self.projection_dim, 1)
+        check_integer("image_height", self.image_height, self.patch_size)
+        check_integer("image_width", self.image_width, self.patch_size)
         check_integer("patch_channels", self.patch_channels, 0)
         check_integer("texture_width", self.texture_width, 0)
         check_number("mlp_ratio", self.mlp_ratio, 1e-3)
@@ -109,10 +107,11 @@ class UniTouchViTConfig(PreTrainedConfig):
     def grid(self) -> tuple[int, int]:
         """Rows and columns of patch tokens."""
         rows = (self.image_height - self.patch_size) // self.patch_stride + 1
-        return rows, (self.image_width - self.patch_size) // self.patch_stride + 1
+        columns = (self.image_width - self.patch_size) // self.patch_stride + 1
+        return rows, columns
 
 
-# ImageBind's, which the paper builds on.
+# Sizes of ImageBind's encoders, which the paper builds on.
 VISION = {
     "hidden_size": 1280,
     "intermediate_size": 5120,
@@ -150,16 +149,17 @@ class UniTouchConfig(PreTrainedConfig):
 
     Args:
         vision_config, text_config: transformers' CLIP configurations. The first may have a `stem`, "patch" or
-            "residual", and behind the latter `patch_channels` and `texture_width`, as in `UniTouchViTConfig`.
+            "residual". With the latter it may have `patch_channels` and `texture_width`, as in `UniTouchViTConfig`.
         touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
-        sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
+        sensor_reaches: Distance from each sensor's prototype within which its own touches lie, by name; see
+            `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
         ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown.
-        embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
+        embedding_norm: Mean L2 norm of the space's image embeddings; conditioning scales every modality to it.
     """
 
     model_type = "unitouch"
@@ -185,13 +185,13 @@ class UniTouchConfig(PreTrainedConfig):
     embedding_norm: float | int = 1.0
 
     def __post_init__(self, **kwargs: Any) -> None:
-        kwargs.pop("auto_map", None)  # of the folder
+        kwargs.pop("auto_map", None)  # belongs to the folder
         check_spelling(UniTouchConfig, kwargs)
         for name in self.sub_configs_defaults:
             check_kind(name, getattr(self, name), dict, PreTrainedConfig, NoneType)
         try:
             super().__post_init__(**kwargs)
-        except StrictDataclassError as error:  # of CLIP's configurations; it is no `ValueError`
+        except StrictDataclassError as error:  # from CLIP's configurations; it is no `ValueError`
             raise InvalidInputError(f"`vision_config` or `text_config`: {error.__cause__}") from error
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)

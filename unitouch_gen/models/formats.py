@@ -20,9 +20,14 @@ SIGNATURES = {
 
 RIFF = {b"WAVE": "a WAV sound", b"AVI ": "a video", b"WEBP": "a WebP image"}
 
-BRANDS = {b"heic": "a HEIC photo", b"heix": "a HEIC photo", b"mif1": "a HEIF photo", b"avif": "an AVIF image"}
-BRANDS |= {b"M4A ": "an M4A sound"}
-"""Major brands of ISO media files (ISO/IEC 14496-12); those with others are videos."""
+BRANDS = {
+    b"heic": "a HEIC photo",
+    b"heix": "a HEIC photo",
+    b"mif1": "a HEIF photo",
+    b"avif": "an AVIF image",
+    b"M4A ": "an M4A sound",
+}
+"""Major brands of ISO media files (ISO/IEC 14496-12). Files with other brands are videos."""
 
 
 def content_kind(content: bytes) -> str:
@@ -37,7 +42,7 @@ def content_kind(content: bytes) -> str:
     if content[4:8] == b"ftyp":
         return BRANDS.get(content[8:12], "a video")
     try:
-        text = codecs.getincrementaldecoder("utf-8")().decode(content[:512])  # its last character may be cut
+        text = codecs.getincrementaldecoder("utf-8")().decode(content[:512])  # the last character may be cut off
     except UnicodeDecodeError:
         return "of no known format"
     if text.lstrip().lower().startswith(("<!doctype html", "<html")):

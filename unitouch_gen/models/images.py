@@ -1,4 +1,4 @@
-"""Images of every kind a user passes, as tensors, and from there as the normalised squares an encoder sees."""
+"""Images from files, PIL, arrays and tensors, and the normalised squares that encoders take."""
 
 import io
 import os
@@ -22,20 +22,24 @@ from unitouch_gen.models.formats import content_kind
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
 
 PNG = b"\x89PNG\r\n\x1a\n"
-PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT")  # that pixels depend on
-PNG_TEXTS = (b"tEXt", b"zTXt", b"iTXt")
-ORIENTED_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # of older ImageMagick and of Adobe
-MOST_PROFILE = 2**26  # bytes of a colour profile
+PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"IDAT", b"IEND", b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"})
+"""Chunks that pixels depend on."""
+
+PNG_TEXTS = frozenset({b"tEXt", b"zTXt", b"iTXt"})
+ORIENTATION_TEXTS = frozenset({b"Raw profile type exif", b"XML:com.adobe.xmp"})
+"""Texts in which older ImageMagick and Adobe store the orientation."""
+
+MOST_PROFILE = 2**26  # largest colour profile, bytes
 
 
 def load_images(name: str, images: ImageInput) -> list[Tensor]:
     """Images as tensors (3, H, W): uint8, or float32 in [0, 1].
 
     Accepts a path (image or .npy), a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3),
-    a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1;
-    grey files and arrays of 16 bits by the fewest bits that hold their values, see `_by_range`; of files in colour, the
-    upper 8 of 16 bits. Files and PIL images are in the colours of their profile, and laid over white where they are
-    transparent, as most viewers show them.
+    a tensor (1 or 3, H, W) or (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1.
+    Grey files and arrays of 16 bits are scaled by the fewest bits that hold their values, see `_by_range`. Of colour
+    files of 16 bits, the upper 8 are read. Files and PIL images are converted by their colour profile, and transparent
+    ones are laid over white, as most viewers show them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no whole image, one is too small or too large, an array has a
@@ -45,7 +49,10 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
         return _load(name, images)
     if not images:
         raise InvalidInputError(f"`{name}` is an empty list; pass at least one image.")
-    return [image for i, item in enumerate(images) for image in _load(f"{name}[{i}]", item)]
+    tensors = list[Tensor]()
+    for index, item in enumerate(images):
+        tensors += _load(f"{name}[{index}]", item)
+    return tensors
 
 
 def _load(name: str, image: Any) -> list[Tensor]:
@@ -56,7 +63,7 @@ def _load(name: str, image: Any) -> list[Tensor]:
         subject = f"`{name}` names {image!r}, which"
         image = _read(subject, image)
     if isinstance(image, Image.Image):
-        _check_size(name, *image.size)  # before its pixels are decoded
+        _check_size(name, *image.size)  # before pixels are decoded
         image = _decoded(subject, image)
     if isinstance(image, np.ndarray):
         image = _channels_first(name, image)
@@ -66,55 +73,55 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 
 def _read(subject: str, file: str) -> Image.Image | np.ndarray:
-    """The image in a file, yet to be decoded, or the array in a .npy file."""
+    """The image in a file, not yet decoded, or the array in a .npy file."""
     with _reading_errors(subject):
         content = Path(file).read_bytes()
         if content.startswith(b"\x93NUMPY"):
             return np.load(io.BytesIO(content), allow_pickle=False)
         try:
-            return _open_png(content) if content.startswith(PNG) else Image.open(io.BytesIO(content))
-        except Image.UnidentifiedImageError as error:  # its text names a buffer in memory
+            if content.startswith(PNG):
+                return _open_png(content)
+            return Image.open(io.BytesIO(content))
+        except Image.UnidentifiedImageError as error:  # its message names a buffer in memory
             raise ValueError(content_kind(content)) from error
 
 
 @contextmanager
 def _reading_errors(subject: str) -> Iterator[None]:
-    """Whatever Pillow's plugins raise on broken files becomes one error."""
+    """Turns whatever Pillow's plugins raise on broken files into an `InvalidInputError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked
-            warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # on broken EXIF
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `_check_size` is stricter
+            warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # warnings on broken EXIF
             yield
     except InvalidInputError:
         raise
     except Exception as error:
-        wanted = (
-            "a smaller one"
-            if isinstance(error, Image.DecompressionBombError)
-            else "a whole PNG, JPEG or other image file"
-        )
-        why = f"{subject} cannot be read as an image ({first_line(error)}); pass {wanted}."
-        raise InvalidInputError(why) from error
+        too_large = isinstance(error, Image.DecompressionBombError)
+        wanted = "a smaller one" if too_large else "a whole PNG, JPEG or other image file"
+        message = f"{subject} cannot be read as an image ({first_line(error)}); pass {wanted}."
+        raise InvalidInputError(message) from error
 
 
 def _open_png(content: bytes) -> Image.Image:
-    """A PNG without what is no part of the picture, such as texts, which Pillow refuses to read beyond 1 MB.
+    """Opens a PNG without chunks that are no part of the picture. Pillow refuses texts beyond 1 MB.
 
-    Image tools keep their graphs of nodes in texts. Two texts stay, in which some tools say how the image is turned.
+    Image tools store their graphs of nodes in texts. The two texts in which some tools store the orientation are kept.
     """
     kept = [PNG]
     profile: bytes | None = None
-    place = len(PNG)
-    while place < len(content):
-        length = int.from_bytes(content[place : place + 4])
-        kind = content[place + 4 : place + 8]
-        data = content[place + 8 : place + 8 + length]
-        chunk = content[place : place + 12 + length]
-        place += len(chunk)
-        whole = chunk[8 + length :] == zlib.crc32(kind + data).to_bytes(4)
+    position = len(PNG)
+    while position < len(content):
+        length = int.from_bytes(content[position : position + 4])
+        kind = content[position + 4 : position + 8]
+        data = content[position + 8 : position + 8 + length]
+        chunk = content[position : position + 12 + length]
+        position += len(chunk)
+        is_damaged = chunk[8 + length :] != zlib.crc32(kind + data).to_bytes(4)
         keyword, _, compressed = data.partition(b"\0")
-        if not whole or kind in PNG_CHUNKS or (kind in PNG_TEXTS and keyword in ORIENTED_TEXTS):
-            kept.append(chunk)  # Pillow refuses what is not whole
+        is_orientation = kind in PNG_TEXTS and keyword in ORIENTATION_TEXTS
+        if is_damaged or kind in PNG_CHUNKS or is_orientation:
+            kept.append(chunk)  # Pillow judges damaged chunks
         elif kind == b"iCCP":
             with suppress(zlib.error):  # a broken profile is left out
                 profile = zlib.decompressobj().decompress(compressed[1:], MOST_PROFILE)
@@ -125,12 +132,12 @@ def _open_png(content: bytes) -> Image.Image:
 
 
 def _decoded(subject: str, image: Any) -> np.ndarray:
-    """Pixels of a PIL image: uint8 (H, W, 3), or float32 (H, W) if deep and grey."""
+    """Pixels of a PIL image: uint8 (H, W, 3), or float32 (H, W) for grey images of more than 8 bits."""
     with _reading_errors(subject):
-        if getattr(image, "n_frames", 1) > 1 and image.tell() == 0 and image.format != "MPO":  # with previews
+        is_sequence = getattr(image, "n_frames", 1) > 1 and image.format != "MPO"  # further frames of MPO are previews
+        if is_sequence and image.tell() == 0:
             warnings.warn(f"{subject} has {image.n_frames} frames; its first one is used.", stacklevel=2)
-        tags = getattr(image, "tag_v2", {})  # of TIFF: bits, whether zero is white, whether it is stored by planes
-        if tags.get(258, (8,))[0] > 8 and (tags.get(262) == 0 or tags.get(284) == 2):
+        if _is_misread_tiff(image):
             kind = "a TIFF of more than 8 bits, of planes or with white as zero"
             raise InvalidInputError(f"{subject} is {kind}, which Pillow misreads; save it as PNG.")
         image = _upright(image)
@@ -138,22 +145,33 @@ def _decoded(subject: str, image: Any) -> np.ndarray:
             return np.asarray(image)
         if image.mode == "I" or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
             return _by_range(subject, np.asarray(image))
-        profile = image.info.get("icc_profile") or b""
-        if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
+        profile = image.info.get("icc_profile")
+        if image.has_transparency_data:  # convert("RGB") alone would show the colours of transparent pixels
             image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
             image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        image = image if image.mode in ("L", "CMYK") else image.convert("RGB")
-        with suppress(ImageCms.PyCMSError, OSError):  # as viewers show it where a profile is broken, or of another mode
-            given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-            srgb = ImageCms.createProfile("sRGB")
-            image = ImageCms.profileToProfile(image, given, srgb, outputMode="RGB") if profile else image
+        if image.mode not in ("L", "CMYK"):
+            image = image.convert("RGB")
+        if profile:
+            with suppress(ImageCms.PyCMSError, OSError):  # viewers ignore a profile that is broken or of another mode
+                source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+                srgb = ImageCms.createProfile("sRGB")
+                image = ImageCms.profileToProfile(image, source, srgb, outputMode="RGB")
         return np.array(image.convert("RGB"))
 
 
+def _is_misread_tiff(image: Any) -> bool:
+    """Whether an image is a TIFF of more than 8 bits that is stored by planes or has white as zero."""
+    tags = getattr(image, "tag_v2", {})
+    bits_per_sample = tags.get(258, (8,))[0]
+    white_is_zero = tags.get(262) == 0
+    by_planes = tags.get(284) == 2
+    return bits_per_sample > 8 and (white_is_zero or by_planes)
+
+
 def _upright(image: Any) -> Any:
-    """An image as its EXIF says to turn it; as it is stored where that is broken, as viewers show it."""
-    if image.format != "TIFF":  # whose tags these are
-        image.load()  # so what is raised below is about EXIF alone
+    """An image turned by its EXIF orientation; as it is stored if EXIF is broken, as viewers show it."""
+    if image.format != "TIFF":  # a TIFF's own tags hold the orientation
+        image.load()  # so that errors below are about EXIF
         try:
             image.getexif().get(ExifTags.Base.Orientation)
         except Exception:  # Pillow's reader raises errors of many kinds
@@ -162,30 +180,34 @@ def _upright(image: Any) -> Any:
 
 
 def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
-    """Integers as uint8, or float32 in [0, 1]: full scale is that of the fewest of 8, 10, 12, 14 or 16 bits."""
+    """Integers as uint8, or float32 in [0, 1], scaled by the fewest of 8, 10, 12, 14 or 16 bits that hold them."""
     low = int(values.min())
     high = int(values.max())
     if low < 0 or high >= 1 << 16:
         raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
     bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
-    full = 2**bits - 1
+    full_scale = 2**bits - 1
     if bits < 16:
-        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full}.", stacklevel=2)
-    return values.astype(np.uint8) if bits == 8 else (values / full).astype(np.float32)
+        warnings.warn(f"{subject} holds values up to {high}; full scale is taken to be {full_scale}.", stacklevel=2)
+    if bits == 8:
+        return values.astype(np.uint8)
+    return (values / full_scale).astype(np.float32)
 
 
 def _channels_first(name: str, array: np.ndarray) -> Tensor:
     """An array (..., H, W, C) as a tensor (..., C, H, W) that shares no memory with it."""
-    if array.dtype.kind not in "uifb":
+    kind = array.dtype.kind
+    if kind not in "uifb":
         raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
     pixels = array[..., None] if array.ndim == 2 else array
     if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
         wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
         raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
-    if array.dtype.kind in "ui" and array.dtype.itemsize == 2 and array.size and array.max() > 255:
+    has_16_bits = kind in "ui" and array.dtype.itemsize == 2
+    if has_16_bits and array.size and array.max() > 255:
         pixels = _by_range(f"`{name}`", pixels)
     elif array.dtype != np.uint8:
-        pixels = pixels.astype(np.float64 if array.dtype.kind in "fb" else np.int64)
+        pixels = pixels.astype(np.float64 if kind in "fb" else np.int64)
     return torch.from_numpy(pixels.copy()).movedim(-1, -3)
 
 
@@ -200,19 +222,21 @@ def _checked(name: str, tensor: Tensor) -> list[Tensor]:
     _check_size(name, tensor.shape[3], tensor.shape[2])
     tensor = tensor.cpu()
     if tensor.dtype != torch.uint8:
-        integers = not (tensor.is_floating_point() or tensor.dtype == torch.bool)
-        tensor = tensor.long() if integers else check_finite(name, tensor).float()
-        low = tensor.min().item()
-        high = tensor.max().item()
-        if low < 0 or high > (255 if integers else 1):
-            found = f"`{name}` holds values from {low:g} to {high:g}"
-            raise InvalidInputError(f"{found}; float images run from 0 to 1 and integer images from 0 to 255.")
-        tensor = tensor.byte() if integers else tensor
+        are_integers = not (tensor.is_floating_point() or tensor.dtype == torch.bool)
+        values = tensor.long() if are_integers else check_finite(name, tensor).float()
+        low = values.min().item()
+        high = values.max().item()
+        if low < 0 or high > (255 if are_integers else 1):
+            raise InvalidInputError(
+                f"`{name}` holds values from {low:g} to {high:g}; float images run from 0 to 1 and integer images from "
+                "0 to 255."
+            )
+        tensor = values.byte() if are_integers else values
     return list(tensor.expand(-1, 3, -1, -1))
 
 
 def _check_size(name: str, width: int, height: int) -> None:
-    """Smaller images hold nothing to see, longer ones would be blown up when their short side is resized."""
+    """Raises for images too small to show anything, and for long ones, which grow when the short side is resized."""
     short, long = sorted((width, height))
     if short < 8 or long > 100 * short or width * height > 8000**2:
         raise InvalidInputError(
@@ -226,17 +250,23 @@ def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:
     rows, columns = image.shape[-2:]
     if (rows, columns) != (height, width):
         # Rounded down, as CLIP's processors do; exact along the side that fits.
-        by_height = rows * width <= columns * height
-        target = (height, columns * height // rows) if by_height else (rows * width // columns, width)
-        image = F.interpolate(image[None], target, mode="bicubic", antialias=True)[0]
-        top = (target[0] - height) // 2
-        left = (target[1] - width) // 2
+        if rows * width <= columns * height:
+            resized_height = height
+            resized_width = columns * height // rows
+        else:
+            resized_height = rows * width // columns
+            resized_width = width
+        image = F.interpolate(image[None], (resized_height, resized_width), mode="bicubic", antialias=True)[0]
+        top = (resized_height - height) // 2
+        left = (resized_width - width) // 2
         image = image[:, top : top + height, left : left + width]
-    return image.float() / 255.0 if image.dtype == torch.uint8 else image.clamp(0.0, 1.0)
+    if image.dtype == torch.uint8:
+        return image.float() / 255.0
+    return image.clamp(0.0, 1.0)
 
 
 def normalise_pixels(raw: Tensor) -> Tensor:
-    """[0, 1] -> zero mean and unit variance by CLIP's statistics, (..., 3, H, W)."""
+    """Pixels in [0, 1] -> zero mean and unit variance by CLIP's statistics, (..., 3, H, W)."""
     mean, deviation = raw.new_tensor([OPENAI_CLIP_MEAN, OPENAI_CLIP_STD])[..., None, None]
     return (raw - mean) / deviation
 
@@ -255,5 +285,7 @@ def local_mean(pixels: Tensor, reach: int) -> Tensor:
     side = 2 * reach + 1
     padded = F.pad(pixels, (reach + 1, reach) * 2, mode="replicate")
     sums = padded.float().cumsum(dim=-1)
-    sums = (sums[..., side:] - sums[..., :-side]).cumsum(dim=-2)
-    return ((sums[..., side:, :] - sums[..., :-side, :]) / side**2).to(pixels.dtype)
+    row_sums = sums[..., side:] - sums[..., :-side]
+    sums = row_sums.cumsum(dim=-2)
+    box_sums = sums[..., side:, :] - sums[..., :-side, :]
+    return (box_sums / side**2).to(pixels.dtype)

@@ -1,4 +1,4 @@
-"""`UniTouchModel`: touch, image, text and audio in one space; each encoder is read from disk when it is first used."""
+"""`UniTouchModel`: touch, image, text and audio in one space. Each encoder is read from disk when it is first used."""
 
 import os
 import threading
@@ -32,18 +32,19 @@ from unitouch_gen.saving import saved_whole
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
-MODULES: dict[str, tuple[str, ...]] = {  # sub-modules of each modality; also the key prefixes on disk
+MODULES: dict[str, tuple[str, ...]] = {
     "image": ("vision_model",),
     "text": ("text_model",),
     "audio": ("audio_model",),
     "touch": ("touch_model", "sensor_bank"),
 }
+"""Sub-modules of each modality, and prefixes of their tensors on disk."""
 
 UNLIKE = "unlike anything known"
 UNTOUCHED = "nothing is touched"
-"""Why a model abstains from naming a touch."""
+"""Reasons why a model does not name a touch."""
 
-_READING = threading.Lock()  # held while an encoder is read: threads that share a model do it once
+_READING = threading.Lock()  # held while an encoder is read, so that threads that share a model read it once
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
@@ -56,8 +57,13 @@ def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module
         return {"text_model": CLIPTextModelWithProjection(config.text_config)}
     if modality == "audio":
         return {"audio_model": UniTouchViT(config.audio_config)}
-    sizes = config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size
-    bank = SensorBank(config.sensors, *sizes, config.sensor_reaches)
+    bank = SensorBank(
+        config.sensors,
+        tokens=config.sensor_tokens,
+        width=config.touch_config.hidden_size,
+        prototype_size=config.prototype_size,
+        reaches=config.sensor_reaches,
+    )
     return {"touch_model": UniTouchViT(config.touch_config), "sensor_bank": bank}
 
 
@@ -91,7 +97,7 @@ class UniTouchModel(PreTrainedModel):
         self.source: Path | None = None  # folder it was read from
         self._stored: dict[str, Tensor] = {}  # the folder's tensors by name
         self._place = torch.empty(0)  # dtype and device of the weights, also of those not read yet
-        self.out_of_distribution = nn.ModuleDict()  # for "touch", if a distance was fitted
+        self.out_of_distribution = nn.ModuleDict()  # the `RelativeDistance` of "touch", if one was fitted
         for modality in modalities:
             self.add(modality)
 
@@ -156,8 +162,8 @@ class UniTouchModel(PreTrainedModel):
         Embeddings of the clips are normalised, then averaged, as in ImageBind.
         """
         (audio_model,) = self.load("audio")
-        every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
-        embeds = F.normalize(audio_model(every_clip), dim=-1)
+        clips = input_values.flatten(0, 1).to(audio_model.projection.weight)
+        embeds = F.normalize(audio_model(clips), dim=-1)
         return embeds.unflatten(0, input_values.shape[:2]).mean(dim=1)
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
@@ -179,7 +185,8 @@ class UniTouchModel(PreTrainedModel):
         The background (1 or B, 3, S, S) is the touches' own sensor untouched, or its mean image.
         """
         _, sensor_bank = self.load("touch")
-        raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
+        zero = denormalise_pixels(torch.zeros_like(pixel_values[:1]))
+        raw = denormalise_pixels(pixel_values - background) - zero
         prototypes = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
         prototypes = F.interpolate(prototypes.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
         return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
@@ -188,8 +195,8 @@ class UniTouchModel(PreTrainedModel):
 
     @property
     def known_modalities(self) -> tuple[str, ...]:
-        """Modalities whose encoders are in memory or can be read."""
-        modules = {*self._modules, *(key.partition(".")[0] for key in self._stored)}
+        """Modalities whose encoders are in memory or on disk."""
+        modules = set(self._modules) | {key.partition(".")[0] for key in self._stored}
         return tuple(modality for modality in MODALITIES if MODULES[modality][0] in modules)
 
     @property
@@ -203,7 +210,7 @@ class UniTouchModel(PreTrainedModel):
         return self._place.device
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Hook behind `to`, `half`, `cuda`; also applies to encoders loaded later."""
+        """Hook behind `to`, `half`, `cuda`; encoders that are loaded later follow."""
         self._place = fn(self._place)
         return super()._apply(fn, recurse)
 
@@ -212,7 +219,7 @@ class UniTouchModel(PreTrainedModel):
         names = MODULES[check_choice("modality", modality, MODALITIES)]
         if names[0] not in self._modules:
             with _READING, torch.inference_mode(False):
-                if names[0] not in self._modules:  # no other thread was faster
+                if names[0] not in self._modules:  # unless another thread was faster
                     self.load_tensors(modality, self._stored)
         return tuple(self._modules[name] for name in names)
 
@@ -226,12 +233,13 @@ class UniTouchModel(PreTrainedModel):
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Builds an encoder from a state dict, without initialising weights."""
         if not any(key.startswith(MODULES[modality][0]) for key in tensors):
-            known = ", ".join(self.known_modalities) or "none"
-            raise InvalidInputError(f"This model has no {modality} encoder; it has {known}. Load one that has it.")
+            modalities = ", ".join(self.known_modalities) or "none"
+            raise InvalidInputError(f"This model has no {modality} encoder; it has {modalities}. Load one that has it.")
         with torch.device("meta"):
             modules = make_modules(self.config, modality)
         for name, module in modules.items():
-            state = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
+            prefix = f"{name}."
+            state = {key.removeprefix(prefix): tensors[key] for key in tensors if key.startswith(prefix)}
             try:
                 module.load_state_dict(state, strict=True, assign=True)
             except RuntimeError as error:
@@ -240,7 +248,7 @@ class UniTouchModel(PreTrainedModel):
                     f"`{self.source}` does not hold the {modality} encoder that its config describes: {wrong}"
                 ) from error
             for part in module.modules():
-                positions = getattr(part, "position_ids", None)  # of transformers' embeddings; no file holds them
+                positions = getattr(part, "position_ids", None)  # transformers' embeddings do not store these
                 if isinstance(positions, Tensor):
                     part.position_ids = torch.arange(positions.shape[-1])[None]
         self._adopt(modules)
@@ -306,19 +314,22 @@ class UniTouchModel(PreTrainedModel):
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:
     """Tensors of a saved model by name, memory-mapped: they are read when used."""
-    part = f".{variant}" if variant else ""
-    found = dict[str, Tensor]()
-    index = folder / f"model.safetensors.index{part}.json"
-    files = {f"model{part}.safetensors"}
+    suffix = f".{variant}" if variant else ""
+    index = folder / f"model.safetensors.index{suffix}.json"
+    names = {f"model{suffix}.safetensors"}
     if index.is_file():
-        files = {Path(file).name for file in read_settings("source", index)["weight_map"].values()}  # never outside
-    for file in sorted(folder / name for name in files):
+        weight_map = read_settings("source", index)["weight_map"]
+        names = {
+            Path(file).name for file in weight_map.values()
+        }  # names alone, so that no file is outside of the folder
+    tensors = dict[str, Tensor]()
+    for file in sorted(folder / name for name in names):
         try:
-            check_file("source", file, "weights")  # a pipe would never be opened
-            found |= load_file(file)
+            check_file("source", file, "weights")  # opening a pipe would block
+            tensors |= load_file(file)
         except (SafetensorError, OSError, InvalidInputError) as error:
             raise InvalidInputError(f"`{file}` cannot be read: {error}. It is missing, cut off or damaged.") from error
-    return found
+    return tensors
 
 
 # Out of distribution --------------------------------------------------------------------------------------------------
@@ -327,7 +338,7 @@ def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor
 class Gaussians(nn.Module):
     """The squared Mahalanobis distance to the nearest of C means (C, F) (Lee et al., 2018, Eq. 2), (B, F) -> (B,).
 
-    W W^T of the `whitening` W (F, F) is the inverse of the covariance that all share.
+    With the `whitening` W (F, F), W W^T is the inverse of the shared covariance.
     """
 
     means: Tensor
@@ -341,17 +352,18 @@ class Gaussians(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         means = self.means.float()
         whitening = self.whitening.float()
-        centre = means.mean(dim=0)  # distances keep their digits near 0
-        apart = torch.cdist((features.float() - centre) @ whitening, (means - centre) @ whitening)
-        return apart.amin(dim=1).square()
+        centre = means.mean(dim=0)  # small numbers lose fewer digits
+        whitened_features = (features.float() - centre) @ whitening
+        whitened_means = (means - centre) @ whitening
+        return torch.cdist(whitened_features, whitened_means).amin(dim=1).square()
 
 
 class RelativeDistance(nn.Module):
-    """The relative Mahalanobis distance of `touch_statistics`, (B, F) -> (B,); the larger, the less like a touch.
+    """The relative Mahalanobis distance of `touch_statistics`, (B, F) -> (B,), higher for images that are no touches.
 
-    It is the distance to the nearest class of known touches, minus that to pictures (Ren et al., 2021, "A simple fix to
-    Mahalanobis distance for improving near-OOD detection"). Touches of sensors drawn anew lie as far from the known
-    touches as photos do, but farther from pictures.
+    It is the distance to the nearest class of training touches, minus that to pictures (Ren et al., 2021, "A simple fix
+    to Mahalanobis distance for improving near-OOD detection"). Touches of unknown sensors lie as far from the training
+    touches as photos do, but further from pictures.
     """
 
     def __init__(self, known: Gaussians, foreign: Gaussians):
@@ -361,8 +373,12 @@ class RelativeDistance(nn.Module):
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "RelativeDistance":
         """Builds it from the state dict of a joint space."""
-        groups = (f"out_of_distribution.touch.groups.{group}" for group in ("known", "foreign"))
-        return cls(*(Gaussians(tensors[f"{group}.means"], tensors[f"{group}.whitening"]) for group in groups))
+
+        def gaussians(group: str) -> Gaussians:
+            prefix = f"out_of_distribution.touch.groups.{group}"
+            return Gaussians(tensors[f"{prefix}.means"], tensors[f"{prefix}.whitening"])
+
+        return cls(gaussians("known"), gaussians("foreign"))
 
     def forward(self, statistics: Tensor) -> Tensor:
         return self.groups["known"](statistics) - self.groups["foreign"](statistics)
@@ -370,11 +386,11 @@ class RelativeDistance(nn.Module):
 
 @torch.no_grad()
 def touch_statistics(patches: Tensor, pixel_values: Tensor) -> Tensor:
-    """What `RelativeDistance` compares, (B, width + 12).
+    """Features of `RelativeDistance`, (B, width + 12).
 
-    An encoder that overlooks differences between sensors overlooks what tells a photo from a touch. So these are the
-    mean patch in front of its first block, and of the pixels: mean and spread of each channel's wide parts, and how the
-    channels' detail correlates. Lamps of several colours show each slope in a channel of its own; shades of a picture
+    An encoder that ignores differences between sensors ignores what distinguishes a photo from a touch. So these are
+    features of its input: the mean output of the stem, mean and spread of each channel, and correlations of the
+    channels' detail. Lamps of several colours show each slope in a channel of its own, whereas shades of a picture
     darken all channels alike.
 
     Args:
@@ -388,15 +404,17 @@ def touch_statistics(patches: Tensor, pixel_values: Tensor) -> Tensor:
     deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
     red, green, _ = (covariance / (deviation[:, :, None] * deviation[:, None])).unbind(dim=1)
     correlations = torch.stack([red[:, 1], red[:, 2], green[:, 2]], dim=1)
-    axes = torch.linalg.eigvalsh(covariance).clamp_min(1e-9).log()
-    wide = F.adaptive_avg_pool2d(pixels, 8).flatten(2).std(dim=2)
-    of_pixels = torch.cat([pixels.mean(dim=(-2, -1)), wide, correlations, axes], dim=1)
+    eigenvalues = torch.linalg.eigvalsh(covariance).clamp_min(1e-9).log()
+    mean = pixels.mean(dim=(-2, -1))
+    spread = F.adaptive_avg_pool2d(pixels, 8).flatten(2).std(dim=2)
+    of_pixels = torch.cat([mean, spread, correlations, eigenvalues], dim=1)
     return torch.cat([patches.float().mean(dim=(-2, -1)), of_pixels.to(patches.device)], dim=1)
 
 
 def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int) -> None:
-    """One warning on the touches that a model abstains from; `stacklevel` as of `warnings.warn`."""
+    """Warns once of all touches that have a reason not to be named; `stacklevel` as of `warnings.warn`."""
     rows = [row for row, reason in enumerate(reasons) if reason]
-    named = "; ".join(f"`touch{f'[{row}]' * (len(reasons) > 1)}`: {reasons[row]}" for row in rows[:3])
+    names = {row: f"`touch[{row}]`" if len(reasons) > 1 else "`touch`" for row in rows}
+    listed = "; ".join(f"{names[row]}: {reasons[row]}" for row in rows[:3])
     more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
-    warnings.warn(f"{named}{more}. What is made of it is a guess.", UnfamiliarInputWarning, stacklevel=stacklevel)
+    warnings.warn(f"{listed}{more}. What is made of it is a guess.", UnfamiliarInputWarning, stacklevel=stacklevel)

@@ -1,8 +1,8 @@
-"""`LanguageBridge`: an embedding of the joint space, put into every attention of a language model (Section 4.6).
+"""`LanguageBridge`: an embedding of the joint space as an adapter token in every attention of a language model.
 
-The paper's T_j^q = h_zero F' + T_j^q as its release computes it, after ImageBind-LLM (Han et al., 2023, "ImageBind-LLM:
-Multi-modality Instruction Tuning"): one adapter token in each layer needs no softmax, so its value is added, through a
-gate of each head, to what the attention gives to every token.
+It computes T_j^q = h_zero F' + T_j^q (Section 4.6 of the paper) as the paper's release does, after ImageBind-LLM (Han
+et al., 2023, "ImageBind-LLM: Multi-modality Instruction Tuning"). A single adapter token in each layer needs no
+softmax. Its value is scaled by a gate for each head, and added to the output of the attention at every token.
 """
 
 from contextlib import ExitStack
@@ -20,7 +20,7 @@ from unitouch_gen.saving import saved_whole
 
 
 class SwiGLU(nn.Module):
-    """A residual block: x + W2 (silu(W1 n(x)) * W3 n(x)), n an RMSNorm; `legacy`: a LayerNorm, and biases."""
+    """A residual block, x + W2 (silu(W1 n(x)) * W3 n(x)), with n an RMSNorm; with `legacy` a LayerNorm, and biases."""
 
     def __init__(self, width: int, hidden: int, legacy: bool):
         super().__init__()
@@ -35,21 +35,21 @@ class SwiGLU(nn.Module):
 
 
 class LanguageBridge(ModelMixin, ConfigMixin):
-    """Projection, residual blocks, a query of each layer, and a zero-initialised gate of each head.
+    """Projection, residual blocks, a query for each layer, and a zero-initialised gate for each head.
 
-    F' = blocks(W e + b), with e at unit length; a_l = F' + q_l; before `o_proj` of layer l, head h of every token gets
-    tanh(g_lh) (W_v a_l)_h, with W_v the layer's own values. At gates of zero nothing is changed.
+    F' = blocks(W e + b), with e at unit length; a_l = F' + q_l. Before `o_proj` of layer l, tanh(g_lh) (W_v a_l)_h is
+    added to head h of every token, with W_v the layer's own value projection. Gates of zero change nothing.
 
     Args:
         embedding_dim: D, width of the embeddings e.
         hidden_size: C, width of the language model.
-        num_layers: L, its attentions.
-        num_heads: H, its query heads.
-        num_blocks: Residual blocks.
-        intermediate_size: Their width inside; default 4 C.
+        num_layers: L, number of its attentions.
+        num_heads: H, number of its query heads.
+        num_blocks: Number of residual blocks.
+        intermediate_size: Width inside of the residual blocks; 4 C if left out.
         legacy: Blocks with LayerNorm and biases.
-        value_rank: r of a low-rank pair that is in W_v, and is not used for a_l: the release fine-tunes W_v for words
-            alone.
+        value_rank: Rank of a low-rank pair that is part of W_v for words, but not for a_l. The release fine-tunes W_v
+            for words only.
     """
 
     save_pretrained = saved_whole(ModelMixin.save_pretrained)
@@ -87,12 +87,17 @@ class LanguageBridge(ModelMixin, ConfigMixin):
     ) -> Self:
         """A new bridge into a language model."""
         config = language_model.config.get_text_config()
-        layers = len(attentions_of(language_model))
-        sizes = config.hidden_size, layers, config.num_attention_heads
-        return cls(embedding_dim, *sizes, num_blocks, intermediate_size)
+        return cls(
+            embedding_dim,
+            hidden_size=config.hidden_size,
+            num_layers=len(attentions_of(language_model)),
+            num_heads=config.num_attention_heads,
+            num_blocks=num_blocks,
+            intermediate_size=intermediate_size,
+        )
 
     def forward(self, embeds: Tensor) -> Tensor:
-        """Adapter tokens a_l (B, L, C) of embeddings (B, D), of which only the direction counts."""
+        """Adapter tokens a_l (B, L, C) of embeddings (B, D); only their direction matters."""
         projected = self.projection(F.normalize(embeds.float(), dim=-1).to(self.projection.weight))
         return self.blocks(projected)[:, None] + self.queries
 
@@ -100,20 +105,26 @@ class LanguageBridge(ModelMixin, ConfigMixin):
         """The language model's attentions; raises `InvalidInputError` if it has no `o_proj`, or other sizes."""
         attentions = attentions_of(language_model)
         config = language_model.config.get_text_config()
-        theirs = {"hidden_size": config.hidden_size, "num_heads": config.num_attention_heads}
-        for name, size in {"num_layers": len(attentions), **theirs}.items():
-            if self.config[name] != size:
-                mine = f"`language_bridge` has `{name}` {self.config[name]}"
-                raise InvalidInputError(f"{mine}, but the language model {size}; pass the bridge that was made for it.")
+        sizes = {
+            "num_layers": len(attentions),
+            "hidden_size": config.hidden_size,
+            "num_heads": config.num_attention_heads,
+        }
+        for name, size in sizes.items():
+            own_size = self.config[name]
+            if own_size != size:
+                raise InvalidInputError(
+                    f"`language_bridge` has `{name}` {own_size}, but the language model {size}; pass the bridge that "
+                    "was made for it."
+                )
         return attentions
 
     def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> ExitStack:
-        """Lets a language model answer about embeddings (B, D), one for each of its inputs.
+        """Adds adapter tokens of embeddings (B, D), one for each input, to a language model.
 
-        The end of a `with` block, or `close()`, undoes it.
-
-        `generate` may repeat each input, as it does for beams and several answers. While gradients are on, they reach
-        the bridge. Not for several threads at once: each would see what all have attached.
+        The end of a `with` block, or `close()`, removes them. `generate` may repeat each input, as for beams and
+        several answers. If gradients are enabled, they reach the bridge. Threads must not share a language model: each
+        would see the adapters of all.
 
         Raises:
             InvalidInputError: If the language model does not fit.
@@ -138,7 +149,7 @@ class AdapterHook:
         self.attention = attention
         self.layer = layer
         self.adapter = adapter
-        self.value: Tensor | None = None  # known from the first forward on, when offloaded weights are in their place
+        self.value: Tensor | None = None  # computed in the first forward, when offloaded weights are on the device
 
     def __call__(self, o_proj: nn.Module, inputs: tuple[Tensor]) -> Tensor:
         (states,) = inputs
@@ -154,9 +165,9 @@ class AdapterHook:
         attention = self.attention
         adapter = self.adapter.to(states)
         gates = bridge.gates[self.layer].tanh().to(states)
-        size = states.shape[-1] // len(gates)  # d, of a head
+        size = states.shape[-1] // len(gates)  # d, width of a head
         value_heads = attention.config.num_key_value_heads
-        project = attention.v_proj if hasattr(attention, "v_proj") else attention.qkv_proj  # v is its last part
+        project = attention.v_proj if hasattr(attention, "v_proj") else attention.qkv_proj  # the last part is v
         value = project(adapter)[:, -value_heads * size :]
         if bridge.value_down is not None and bridge.value_up is not None:
             down = bridge.value_down[self.layer].to(states)
@@ -168,9 +179,12 @@ class AdapterHook:
 
 def attentions_of(language_model: PreTrainedModel) -> list[Any]:
     """The attentions of a causal language model in order; raises `InvalidInputError` if none ends in `o_proj`."""
-    ending = [module for module in language_model.modules() if hasattr(module, "o_proj")]
-    found = [module for module in ending if hasattr(module, "v_proj") or hasattr(module, "qkv_proj")]
-    if not found:
+    attentions = list[Any]()
+    for module in language_model.modules():
+        has_values = hasattr(module, "v_proj") or hasattr(module, "qkv_proj")
+        if has_values and hasattr(module, "o_proj"):
+            attentions.append(module)
+    if not attentions:
         kind = type(language_model).__name__
         raise InvalidInputError(f"`language_model` is a {kind}, whose attention has no `o_proj`; pass one like LLaMA.")
-    return found
+    return attentions

@@ -1,4 +1,4 @@
-"""`UniTouchProcessor`: paths, pictures, arrays, sounds and strings in, model inputs out."""
+"""`UniTouchProcessor`: from paths, pictures, arrays, sounds and strings to model inputs."""
 
 import os
 import threading
@@ -20,9 +20,9 @@ from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
 from unitouch_gen.models.videos import VIDEOS, firmest
 from unitouch_gen.saving import saved_whole
 
-LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
+LENGTHS = (3, 10_000)  # allowed lengths of texts in tokens, with start and end; CLIP's is 77
 
-_TOKENIZING = threading.Lock()  # tokenizers keep how to cut and pad on themselves: two threads would tell them at once
+_TOKENIZING = threading.Lock()  # tokenizers store truncation and padding on themselves, which two threads would set
 
 
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
@@ -33,20 +33,22 @@ def tokenize(tokenizer: Any, texts: list[str]) -> Any:
 
 
 def read_tokenizer(name: str, folder: Path, kind: Any = CLIPTokenizer) -> Any:
-    """A tokenizer from its folder, which the user passed as the argument `name`; `kind` is its class."""
+    """A tokenizer of class `kind` from its folder, which the user passed as the argument `name`."""
     with reading(name, folder):
         check_saved(folder, "tokenizer")
         return kind.from_pretrained(folder)
 
 
 def _still(name: str, touch: Any) -> Any:
-    """The touch itself; of a video or an iterator of frames, the frame of firmest contact."""
-    video = isinstance(touch, str | os.PathLike) and str(touch).lower().endswith(VIDEOS)
-    return firmest(name, touch) if video or isinstance(touch, Iterator) else touch
+    """The frame of firmest contact of a video or an iterator of frames; anything else as it is."""
+    is_video = isinstance(touch, str | os.PathLike) and str(touch).lower().endswith(VIDEOS)
+    if is_video or isinstance(touch, Iterator):
+        return firmest(name, touch)
+    return touch
 
 
 class UniTouchProcessor(FeatureExtractionMixin):
-    """Turns what users have into what `UniTouchModel` takes.
+    """Prepares the inputs of `UniTouchModel`.
 
     Args:
         image_size: Side S of pictures and touch images, pixels, from 8 to 8,000 (paper: 224).
@@ -68,7 +70,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         tokenizer: CLIPTokenizer | None = None,
         **kwargs: Any,
     ):
-        kwargs.pop("auto_map", None)  # the folder's, not the processor's
+        kwargs.pop("auto_map", None)  # belongs to the folder
         super().__init__(**kwargs)
         self.image_size = check_integer("image_size", image_size, 8, 8000)
         check_kind("audio", audio, LogMel, dict, type(None))
@@ -77,9 +79,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
     @classmethod
     def for_config(cls, config: PreTrainedConfig, tokenizer: CLIPTokenizer | None = None) -> "UniTouchProcessor":
-        """The processor of inputs of the sizes that a model with this `UniTouchConfig` takes."""
-        clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
-        return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
+        """The processor for the input sizes of a model with this `UniTouchConfig`."""
+        audio = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
+        return cls(image_size=config.touch_config.image_height, audio=audio, tokenizer=tokenizer)
 
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images`."""
@@ -88,21 +90,22 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
-        Of a video or an iterator of frames it is the frame of firmest contact; see `videos.firmest`.
+        From a video or an iterator of frames, the frame of firmest contact is taken; see `videos.firmest`.
         """
         if isinstance(touch, list | tuple):
-            return self.images([_still(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
+            stills = [_still(f"{name}[{row}]", item) for row, item in enumerate(touch)]
+            return self.images(stills, name=name)
         return self.images(_still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
-        """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
+        """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cropped."""
         side = self.image_size
         return torch.stack([centre_rectangle(image, side, side) for image in load_images(name, images)])
 
     def sounds(self, sounds: AudioInput, *, name: str = "audio", audible: bool = False) -> Tensor:
         """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`; see `load_sounds`.
 
-        With `audible`, silence is refused.
+        With `audible`, silence raises an `InvalidInputError`.
         """
         loaded = load_sounds(name, sounds)
         for number, sound in enumerate(loaded):
@@ -123,7 +126,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """The content of `preprocessor_config.json`."""
         output = super().to_dict()
         output.pop("tokenizer", None)
-        return {**output, "processor_class": type(self).__name__, "audio": asdict(self.audio)}  # for AutoProcessor
+        output["processor_class"] = type(self).__name__  # read by AutoProcessor
+        output["audio"] = asdict(self.audio)
+        return output
 
     @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> None:  # type: ignore[override]
@@ -136,7 +141,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def from_pretrained(  # type: ignore[override]
         cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
     ) -> "UniTouchProcessor":
-        """Reads what `save_pretrained` wrote, from its folder or from a repository.
+        """Reads a processor from a folder or a repository.
 
         `kwargs` are options of a download, and `image_size` and `audio` in place of the stored ones.
         """

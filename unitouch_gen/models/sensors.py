@@ -15,32 +15,33 @@ Sensors = str | Sequence[str | None] | None
 
 @dataclass(frozen=True)
 class SensorMatch:
-    """The sensor whose tokens an image gets, `None` for one outside of the bank; and its `SensorBank.distances` from
-    that sensor, or from the nearest, `None` where the bank has no prototype."""
+    """The sensor of one image."""
 
-    name: str | None
-    distance: float | None
+    name: str | None  # the sensor whose tokens the image gets; `None` for a sensor outside of the bank
+    distance: float | None  # its `SensorBank.distances` from that sensor, or the nearest; `None` without a prototype
 
 
 def layout_distances(images: Tensor, prototype: Tensor) -> Tensor:
-    """Mean absolute differences of 8 x 8 areas' colours, of images (B, 3, S, S) to a prototype (3, P, P), (B,).
+    """Mean absolute difference of images (B, 3, S, S) from a prototype (3, P, P), both pooled to 8 x 8 cells, (B,).
 
-    By these none of 1,200 touches of other sensors is within reach; by the colours of all pixels some are.
+    By these distances none of 1,200 touches of other sensors is within reach. By the colours of all pixels some are.
     """
-    areas, known = (F.adaptive_avg_pool2d(pixels, 8) for pixels in (images, prototype))
-    return (areas - known).abs().mean(dim=(1, 2, 3))
+    image_cells = F.adaptive_avg_pool2d(images, 8)
+    prototype_cells = F.adaptive_avg_pool2d(prototype, 8)
+    return (image_cells - prototype_cells).abs().mean(dim=(1, 2, 3))
 
 
 class SensorBank(nn.Module):
-    """L learnable tokens for each of K sensors, with each sensor's prototype: the mean of the images that it took.
+    """L learnable tokens for each of K sensors, and each sensor's prototype, the mean of its images.
 
     Args:
         names: Names of the K sensors; K may be 0, which means no prefix.
         tokens: L, tokens for each sensor.
         width: Width of the transformer that the tokens enter.
         prototype_size: Side S of the raw images, in [0, 1], behind the prototypes, pixels.
-        reaches: How far a sensor's own touches lie from its prototype, by name; see `layout_distances`. With them, an
-            image that is farther from every sensor is of none; without, the nearest is taken.
+        reaches: Distance from each sensor's prototype within which its own touches lie, by name; see
+            `layout_distances`. An image that is out of reach of all sensors has none of them. Without reaches, the
+            nearest sensor is taken.
     """
 
     tokens: nn.Parameter
@@ -83,40 +84,52 @@ class SensorBank(nn.Module):
     def match(self, raw_pixels: Tensor, sensor: Sensors = None, *, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each image (B, 3, S, S) in [0, 1]: the one named, or the one that is retrieved.
 
-        That is the nearest prototype by L1 distance (as in the paper) of mean colours of 8 x 8 areas. Where the bank
-        has `reaches`, it is none where the image is out of reach of all, unless the `nearest` is asked for.
+        The sensor with the nearest prototype is retrieved, by L1 distance (as in the paper) of the mean colours of
+        8 x 8 cells. If the bank has `reaches`, an image out of reach of all sensors has none, unless `nearest` is set.
         """
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
-        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
-        if len(wanted) != len(raw_pixels):
-            counts = f"a list of {len(wanted)} for {len(raw_pixels)} touch images"
+        names = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
+        if len(names) != len(raw_pixels):
+            counts = f"a list of {len(names)} for {len(raw_pixels)} touch images"
             raise InvalidInputError(f"`sensor` is {counts}; pass one name, one each, or None to retrieve them.")
-        indices = [None if name is None else self.index(name) for name in wanted]
+        indices = [None if name is None else self.index(name) for name in names]
         if not self.names:
             return [SensorMatch(None, None)] * len(raw_pixels)
         if None in indices and not bool(self.known.any()):
             stored = "this model stores no prototypes to retrieve one by"
             raise InvalidInputError(f"`sensor` is None, but {stored}; name one of {self.names}.")
         matches = []
-        for index, row in zip(indices, self.distances(raw_pixels), strict=True):
-            chosen = int(row.argmin()) if index is None else index
-            out_of_reach = index is None and self.reaches and not nearest and row[chosen] > 1.0
-            distance = row[chosen].item() if row[chosen].isfinite() else None
-            matches.append(SensorMatch(None if out_of_reach else self.names[chosen], distance))
+        for index, distances in zip(indices, self.distances(raw_pixels), strict=True):
+            chosen = int(distances.argmin()) if index is None else index
+            distance = distances[chosen]
+            out_of_reach = index is None and self.reaches and not nearest and distance > 1.0
+            name = None if out_of_reach else self.names[chosen]
+            matches.append(SensorMatch(name, distance.item() if distance.isfinite() else None))
         return matches
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
-        """`layout_distances` of images (B, 3, S, S) to each prototype, (B, K), over the sensors' reaches where there
-        are any; infinite where a prototype or a reach is unknown."""
-        looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
-        reaches = looks.new_tensor([self.reaches.get(name, 0.0) if self.reaches else 1.0 for name in self.names])
-        distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
-        return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
+        """`layout_distances` of images (B, 3, S, S) to each prototype, in units of the sensor's reach, (B, K).
+
+        Without reaches the unit is 1. A distance is infinite if the prototype or the reach is unknown.
+        """
+        prototypes = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
+        images = raw_pixels.to(prototypes)
+        distances = torch.stack([layout_distances(images, prototype) for prototype in prototypes], dim=1)
+        reaches = prototypes.new_ones(len(self.names))
+        if self.reaches:
+            reaches = prototypes.new_tensor([self.reaches.get(name, 0.0) for name in self.names])
+        unknown = ~self.known | (reaches == 0.0)
+        return (distances / reaches.clamp_min(1e-6)).masked_fill(unknown, float("inf"))
 
     def encode(self, encoder: Callable[..., Tensor], inputs: Tensor, indices: Tensor) -> Tensor:
-        """An encoder's output for inputs (B, ...) with the tokens of their sensors; index -1 has none."""
-        known, others = (rows.nonzero()[:, 0] for rows in (indices >= 0, indices < 0))
-        parts = [encoder(inputs[known], self.tokens[indices[known].long()])] if len(known) else []
-        parts += [encoder(inputs[others], None)] if len(others) else []
-        return torch.cat(parts)[torch.cat([known, others]).argsort()]
+        """An encoder's output for inputs (B, ...) with the tokens of their sensors; those of index -1 get no tokens."""
+        with_tokens = (indices >= 0).nonzero()[:, 0]
+        without_tokens = (indices < 0).nonzero()[:, 0]
+        outputs = list[Tensor]()
+        if len(with_tokens):
+            outputs.append(encoder(inputs[with_tokens], self.tokens[indices[with_tokens].long()]))
+        if len(without_tokens):
+            outputs.append(encoder(inputs[without_tokens], None))
+        order = torch.cat([with_tokens, without_tokens]).argsort()
+        return torch.cat(outputs)[order]

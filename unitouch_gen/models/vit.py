@@ -18,7 +18,7 @@ from transformers.models.clip.modeling_clip import CLIPVisionEmbeddings
 
 from unitouch_gen.models.config import UniTouchViTConfig
 from unitouch_gen.models.images import local_mean
-from unitouch_gen.models.relief import RELIEF_CHANNELS, BesideRelief
+from unitouch_gen.models.relief import RELIEF_CHANNELS, ConcatRelief
 from unitouch_gen.models.texture import Texture
 
 
@@ -37,11 +37,11 @@ class Block(nn.Module):
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width = config.hidden_size
-        hidden = int(config.mlp_ratio * config.hidden_size)
+        hidden = int(config.mlp_ratio * width)
         self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
-        heads = config.num_attention_heads
-        bias = config.add_bias_kv
-        self.attention = nn.MultiheadAttention(width, heads, add_bias_kv=bias, batch_first=True)
+        self.attention = nn.MultiheadAttention(
+            width, config.num_attention_heads, add_bias_kv=config.add_bias_kv, batch_first=True
+        )
         self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
 
@@ -52,10 +52,10 @@ class Block(nn.Module):
 
 
 class LocalContrast(nn.Module):
-    """An image beside its detail, (B, C, H, W) -> (B, 2 C, H, W).
+    """An image and its detail, (B, C, H, W) -> (B, 2 C, H, W).
 
-    Detail is the difference from the mean over 6 % of the side, over its deviation in the image. Lamps and gel make the
-    smooth part of a touch and the strength of its contrast; what presses into the gel makes the rest.
+    Detail is the difference from the mean over 6 % of the side, divided by its deviation in the image. The smooth part
+    and the contrast of a touch depend on lamps and gel; the rest depends on what presses into the gel.
     """
 
     def __init__(self, side: int):
@@ -70,7 +70,7 @@ class LocalContrast(nn.Module):
 
 
 class Residual(nn.Module):
-    """A convolution beside its input (He et al., 2016), (B, C, H, W) -> the same."""
+    """A residual convolution (He et al., 2016), (B, C, H, W) -> the same."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -82,29 +82,36 @@ class Residual(nn.Module):
 
 
 def residual_stem(config: Any, side: int) -> list[nn.Module]:
-    """Local contrast, or relief of touches; then a stride-2 and a residual convolution a halving; then a projection.
+    """Layers from an image to its patches: local contrast or relief, convolutions that halve it, a projection.
 
-    Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as
-    drawn ones do are then hardly told apart. `side` is the images' shorter one.
+    Each halving is a stride-2 convolution and a residual one. Norms are over the batch: a norm over the sample removes
+    its contrast, and touches of random sensors are then hardly distinguished. `side` is the images' shorter side.
     """
-    of_touch = getattr(config, "stem", "residual") == "relief"
-    channels = config.num_channels
-    layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
-    channels = channels + RELIEF_CHANNELS if of_touch else 2 * channels
+    layers: list[nn.Module]
+    if getattr(config, "stem", "residual") == "relief":
+        layers = [ConcatRelief()]
+        channels = config.num_channels + RELIEF_CHANNELS
+    else:
+        layers = [LocalContrast(side)]
+        channels = 2 * config.num_channels
     halvings = config.patch_size.bit_length() - 1
     for level in range(halvings):
-        width = max(config.hidden_size >> (halvings - 1 - level), 16)  # twice as many each time, up to `hidden_size`
-        layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
-        layers += [Residual(width)]
+        width = max(config.hidden_size >> (halvings - 1 - level), 16)  # doubles at each level, up to `hidden_size`
+        layers += [
+            nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
+            Residual(width),
+        ]
         channels = width
-    # The last norm takes away what all images share, which would be most of their mean.
+    # The last norm removes what all images share, which would be most of the patches' mean.
     return [*layers, nn.Conv2d(channels, config.hidden_size, 1), nn.BatchNorm2d(config.hidden_size)]
 
 
 class PatchProjection(nn.Module):
-    """What patches add to an embedding, each through weights of its place, (B, patches, width) -> (B, D).
+    """A position-wise head on patches that is added to the embedding, (B, patches, width) -> (B, D).
 
-    A class token of a small transformer learns what is in a view long before it learns where.
+    The class token of a small transformer learns what is in a view long before it learns where it is.
     """
 
     def __init__(self, config: Any, patches: int):
@@ -120,17 +127,17 @@ class PatchProjection(nn.Module):
 class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
-    Behind the stems "residual" and "relief" the class token begins at the mean of the patches.
+    With the stems "residual" and "relief" the class token starts at the mean of the patches.
     """
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width = config.hidden_size
-        self.begins_at_mean = config.stem != "patch"
-        if self.begins_at_mean:
+        self.starts_at_mean = config.stem != "patch"
+        if self.starts_at_mean:
             side = min(config.image_height, config.image_width)
             self.stem: nn.Module = nn.Sequential(*residual_stem(config, side))
-        else:  # as in CLIP, no bias
+        else:  # without a bias, as in CLIP
             self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
         self.stem_norm = nn.LayerNorm(width, eps=1e-5) if config.stem_norm else None
         rows, columns = config.grid
@@ -151,7 +158,7 @@ class UniTouchViT(nn.Module):
         return embeds if self.texture is None else embeds + self.texture(pixels)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Embeddings (B, D) of the blocks' output, see `tokens`, which may lack the prefix."""
+        """Embeddings (B, D) of the blocks' output, see `tokens`, with or without the prefix."""
         embeds = self.projection(self.norm(tokens[:, 0]))
         if self.patch_projection is not None:
             embeds = embeds + self.patch_projection(tokens[:, 1 - self.position.shape[1] :])
@@ -166,8 +173,8 @@ class UniTouchViT(nn.Module):
         if self.stem_norm is not None:
             x = self.stem_norm(x)
         x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
-        if self.begins_at_mean:
-            x = begun_at_the_mean(x)
+        if self.starts_at_mean:
+            x = start_at_mean(x)
         x = x.to(torch.promote_types(x.dtype, torch.float32)) + self.position
         if prefix is not None:
             x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
@@ -176,31 +183,34 @@ class UniTouchViT(nn.Module):
         return x
 
 
-def begun_at_the_mean(tokens: Tensor) -> Tensor:
-    """Tokens of class and patches, (B, 1 + patches, width), the first with the mean of the others added to it.
+def start_at_mean(tokens: Tensor) -> Tensor:
+    """Adds the mean of the patch tokens to the class token, (B, 1 + patches, width) -> the same.
 
-    From a class token alone, the blocks have to learn to look at the patches first.
+    With the class token alone, the blocks would first have to learn to attend to the patches.
     """
-    return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
+    class_token = tokens[:, :1]
+    patches = tokens[:, 1:]
+    return torch.cat([class_token + patches.mean(dim=1, keepdim=True), patches], dim=1)
 
 
 def initialise(module: nn.Module) -> None:
-    """Truncated normals of 0.02 for weights and tokens, zeros for biases (as in ViT and CLIP)."""
+    """Truncated normals for weights and tokens, with a deviation of 0.02, and zeros for biases (as in ViT and CLIP)."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         std = 0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
         nn.init.trunc_normal_(module.weight, std=std)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
     for name in ("in_proj_weight", "bias_k", "bias_v", "class_token", "position"):
-        if isinstance(token := getattr(module, name, None), nn.Parameter):
-            nn.init.trunc_normal_(token, std=0.02)
+        parameter = getattr(module, name, None)
+        if isinstance(parameter, nn.Parameter):
+            nn.init.trunc_normal_(parameter, std=0.02)
 
 
 # CLIP's vision tower behind a stem of convolutions --------------------------------------------------------------------
 
 
 class Stem(nn.Sequential):
-    """`residual_stem`, where transformers expects one convolution and asks for the dtype of its weight."""
+    """`residual_stem` in the place of CLIP's convolution, whose `weight` transformers reads the dtype of."""
 
     @property
     def weight(self) -> Tensor:
@@ -208,18 +218,19 @@ class Stem(nn.Sequential):
 
 
 class StemmedEmbeddings(CLIPVisionEmbeddings):
-    """Patch tokens made by a stem; the class token begins at their mean."""
+    """Patch tokens from a stem of convolutions; the class token starts at their mean."""
 
     def __init__(self, config: Any):
         super().__init__(config)
         self.patch_embedding = Stem(*residual_stem(config, config.image_size)).apply(initialise)  # type: ignore[assignment]
 
     def forward(self, pixel_values: Tensor, interpolate_pos_encoding: bool = False) -> Tensor:
-        return begun_at_the_mean(super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding))
+        tokens = super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding)
+        return start_at_mean(tokens)
 
 
 class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
-    """`CLIPVisionModelWithProjection` with patches made by residual convolutions (Xiao et al., 2021).
+    """`CLIPVisionModelWithProjection` with patches from residual convolutions (Xiao et al., 2021).
 
     Args:
         config: With a `patch_size` that is a power of two and divides `image_size`, and perhaps `patch_channels` and
@@ -238,9 +249,10 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
             self.texture = Texture(config.texture_width, config.projection_dim)
 
     def forward(self, pixel_values: Tensor, **options: Any) -> Any:
-        made: Any = super().forward(pixel_values, **options)
+        output: Any = super().forward(pixel_values, **options)
         if self.patch_projection is not None:
-            made.image_embeds = made.image_embeds + self.patch_projection(made.last_hidden_state[:, 1:])
+            patches = output.last_hidden_state[:, 1:]
+            output.image_embeds = output.image_embeds + self.patch_projection(patches)
         if self.texture is not None:
-            made.image_embeds = made.image_embeds + self.texture(pixel_values)
-        return made
+            output.image_embeds = output.image_embeds + self.texture(pixel_values)
+        return output
