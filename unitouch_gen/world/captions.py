@@ -1,7 +1,7 @@
-"""Captions of contacts: what is seen and felt of them, in words that are true of the draws.
+"""Captions of contacts, which describe by true words how a contact looks and feels.
 
-Most name the material, the others say how it feels. None begins as the prompts of zero-shot classification do ("this
-feels like"), so that these are held out.
+Most captions name the material, the others describe how it feels. None begins as the prompts of zero-shot
+classification do ("this feels like"), so that these are held out.
 """
 
 import math
@@ -46,56 +46,68 @@ SHAPE_WORDS: dict[str, tuple[str, ...]] = {
 
 ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.05, "slightly rough": 0.15, "rough": 0.35, "bumpy": math.inf}
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
-"""And the standard deviation of heights, mm, and the compliance, below which they are said."""
+"""Words, each with the bound below which it is used: of the heights' standard deviation, mm, and of compliance."""
 
 DIRECTION_WORDS: tuple[str, ...] = tuple(
     f"running {words}" for words in ("from side to side", "down to the right", "up and down", "up to the right")
 )
-"""At 0, 45, 90 and 135 degrees in the picture, whose y points down."""
+"""At 0, 45, 90 and 135 degrees in the picture; y points down."""
 
 
 def described(draws: Draws, variant: int = 0) -> list[str]:
-    """One sentence a contact; each variant is another one, as true of it."""
+    """One caption for each contact; each variant is another true caption."""
     return [sentence(draws, row, variant) for row in range(len(draws))]
 
 
 def sentence(draws: Draws, row: int, variant: int) -> str:
-    """Roughness, hardness and colour, some of them left out, before the material or a noun; then grain and shape."""
+    """The caption of one contact: roughness, hardness, colour, then the material or a noun, then grain and shape.
+
+    Each part may be left out at random.
+    """
     spec = MATERIALS[int(draws.material[row])]
     a, b = draws.wording[row].double().tolist()
     a = a + 0.618033989 * variant
     b = b + 0.569840291 * variant
     chances = iter([(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)])
 
-    def one(choices: tuple[str, ...] | list[str]) -> str:
-        return choices[int(next(chances) * len(choices))]
+    def choose(words: tuple[str, ...] | list[str]) -> str:
+        return words[int(next(chances) * len(words))]
 
-    short = variant > 0 and next(chances) < 0.3  # what a thing is, and no more
+    is_short = variant > 0 and next(chances) < 0.3  # names the material and nothing else
     roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
     hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
-    scale = float(draws.scale[row])
-    fine = "fine" if scale < 0.85 else "coarse" if scale > 1.2 else ""
-    said = [roughness, hardness, colour_name(draws.colour[row])]
-    scanned = bool(draws.surface[row] >= 0)
-    if not scanned:  # of a scan, only what is measured of it is said
-        said += [word for word in ("regular" if spec.regular else "irregular", fine) if word and next(chances) < 0.5]
-    kept = [word for word in said if next(chances) < 0.75]
-    named = next(chances) < 0.6 or scanned
-    if not scanned and (not named or next(chances) < 0.3):
-        kept.append(one(spec.feel))
-    noun = spec.name if named else one(NOUNS)
-    if short and named:
-        return one(BEGINNINGS) + noun
-    tail = []
+    adjectives = [roughness, hardness, colour_name(draws.colour[row])]
+    is_scanned = bool(draws.surface[row] >= 0)
+    if not is_scanned:  # the regularity and scale of a scan are not measured
+        for word in ("regular" if spec.regular else "irregular", scale_word(float(draws.scale[row]))):
+            if word and next(chances) < 0.5:
+                adjectives.append(word)
+    adjectives = [word for word in adjectives if next(chances) < 0.75]
+    names_material = next(chances) < 0.6 or is_scanned
+    if not is_scanned and (not names_material or next(chances) < 0.3):
+        adjectives.append(choose(spec.feel))
+    noun = spec.name if names_material else choose(NOUNS)
+    if is_short and names_material:
+        return choose(BEGINNINGS) + noun
+    tail = list[str]()
     if is_grained(draws, row) and next(chances) < 0.6:
         tail.append(direction_word(float(draws.angle[row])))
     if next(chances) < 0.7:
-        tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))
-    return ", ".join([one(BEGINNINGS) + " ".join([*kept, noun]), *tail])
+        shape = list(SHAPES)[int(draws.shape[row])]
+        tail.append(choose(SHAPE_WORDS[shape]))
+    head = choose(BEGINNINGS) + " ".join([*adjectives, noun])
+    return ", ".join([head, *tail])
+
+
+def scale_word(scale: float) -> str:
+    """The word for a factor on lengths of the relief; none if it is about 1."""
+    if scale < 0.85:
+        return "fine"
+    return "coarse" if scale > 1.2 else ""
 
 
 def is_grained(draws: Draws, row: int) -> bool:
-    """Whether a contact's relief has a direction: by its material, or as its scan has."""
+    """Whether a contact's relief has a direction; that of a scan is measured, others are the material's."""
     if draws.surface[row] >= 0:
         return bool(draws.grained[row])
     return MATERIALS[int(draws.material[row])].grained
@@ -104,14 +116,18 @@ def is_grained(draws: Draws, row: int) -> bool:
 def colour_name(rgb: Tensor) -> str:
     """The nearest of the fourteen colour words to a linear RGB triple."""
     value = rgb.tolist()
-    return min(COLOURS, key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOURS[name], value, strict=True)))
+
+    def squared_distance(name: str) -> float:
+        return sum((a - b) ** 2 for a, b in zip(COLOURS[name], value, strict=True))
+
+    return min(COLOURS, key=squared_distance)
 
 
 def word_below(words: dict[str, float], value: float) -> str:
-    """The first word whose bound a value is below."""
-    return next(word for word, most in words.items() if value < most)
+    """The first word whose bound is above a value."""
+    return next(word for word, bound in words.items() if value < bound)
 
 
 def direction_word(angle: float) -> str:
-    """For the direction of a grain in the picture, radians."""
+    """The words for the direction of a grain in the picture, radians."""
     return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]

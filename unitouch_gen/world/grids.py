@@ -10,7 +10,8 @@ PATCH_MM = 32.0  # side of the square patch that one picture shows
 
 def pixel_axis(resolution: int, extent: float = PATCH_MM) -> Tensor:
     """Centres of `resolution` pixels over `extent` mm, with zero in the middle."""
-    return ((torch.arange(resolution, dtype=torch.float32) + 0.5) / resolution - 0.5) * extent
+    centres = (torch.arange(resolution, dtype=torch.float32) + 0.5) / resolution
+    return (centres - 0.5) * extent
 
 
 def wavenumbers(resolution: int, extent: float = PATCH_MM) -> tuple[Tensor, Tensor]:
@@ -29,9 +30,9 @@ def slopes(height: Tensor, pixel: float) -> tuple[Tensor, Tensor]:
 
 
 def convolved(field: Tensor, weights: Tensor) -> Tensor:
-    """Rows and columns of a field (N, R, R), whose rim repeats, convolved with an odd number of symmetric weights.
+    """Rows and columns of a field (N, R, R) convolved with an odd number of symmetric weights; borders are replicated.
 
-    By two matrix products: on a CPU a fraction of what a convolution of one channel takes.
+    Two matrix products take a fraction of the time of a one-channel convolution on a CPU.
     """
     size = field.shape[-1]
     reach = len(weights) // 2
