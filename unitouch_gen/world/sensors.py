@@ -1,8 +1,8 @@
-"""Camera-based tactile sensors: real ones, and ones that are drawn at random.
+"""Camera-based tactile sensors: models of real ones, and random ones.
 
-Those of `SENSORS` are real, as far as published measurements of them tell. For each `calibrated_sensors.json` names
-sources and licences, and parts its values by where they are from: `published` by a source, `measured` on its frames,
-`fitted` to its calibration table and frames, or `guessed`, where no source tells. `settings` are of rendering.
+The sensors in `SENSORS` follow published measurements of real ones. `calibrated_sensors.json` has their sources and
+licences, and groups their values by origin: `published` by a source, `measured` on its frames, `fitted` to its
+calibration table and frames, or `guessed`, where there is no source. `settings` are of rendering.
 """
 
 import json
@@ -23,26 +23,26 @@ class Sensor:
     """Gel, lights and camera of one sensor: lengths in mm, angles in degrees, times in s."""
 
     name: str  # lower case, as users type it
-    field_of_view: float  # side of the square of gel that the camera sees
-    thickness: float  # of the gel; no contact can displace it further
+    field_of_view: float  # side of the square of gel in the camera's view
+    thickness: float  # of the gel, and largest displacement
     correlation: float  # length over which the gel spreads a displacement
     relaxation: float  # time constant of the gel's creep
     azimuths: tuple[float, ...]  # direction of each light around the gel
-    elevation: tuple[float, ...]  # angle of each above the gel's plane
-    colours: tuple[Colour, ...]  # linear RGB of each
-    falloff: float  # by how much a light is stronger at the rim next to it than in the middle, share, [0, 1]
-    gain: float  # brightness change by a facet that turns fully toward a light
+    elevation: tuple[float, ...]  # angle of each light above the gel's plane
+    colours: tuple[Colour, ...]  # linear RGB of each light
+    falloff: float  # gain of a light at the border next to it over the middle, share, [0, 1]
+    gain: float  # brightness change of a facet that is turned fully toward a light
     backdrop: tuple[tuple[tuple[float, ...], ...], ...]  # the untouched gel on a coarse grid, (3, h, w) values
     blur: float  # standard deviation of the camera's blur
     noise: float  # standard deviation of the camera's noise, in units of full scale
     marker_pitch: float = 0.0  # spacing of printed markers; 0 for a plain gel
     marker_radius: float = 0.0
     marker_ink: float = 0.6  # share of the light that a marker takes
-    gradients: tuple[tuple[float, float], ...] = ()  # how much more of each light falls on the rim, along x and y
-    tint: Colour = (0.0, 0.0, 0.0)  # how much each channel gains for each mm of displacement
+    gradients: tuple[tuple[float, float], ...] = ()  # gain of each light toward the border, along x and y
+    tint: Colour = (0.0, 0.0, 0.0)  # gain of each channel for each mm of displacement
     contact_steps: int = 0  # of ADMM, see `gel_displacement`; 0 spreads all of a contact
-    gamma: float = 1.0  # power that the camera raises its values to
-    dome: float = 0.0  # how far the gel bulges, in its middle over the rim of what the camera sees
+    gamma: float = 1.0  # exponent of the camera's response
+    dome: float = 0.0  # bulge of the gel, its middle over the border of the view
 
 
 NUMBERS = Path(__file__).with_name("calibrated_sensors.json")
@@ -54,9 +54,12 @@ def frozen(value: Any) -> Any:
 
 
 def calibrated(name: str, entry: dict[str, Any]) -> Sensor:
-    """The sensor of an entry of `calibrated_sensors.json`, whose parts beside sources and licences hold its values."""
-    values = {field: value for part in entry.values() if isinstance(part, dict) for field, value in part.items()}
-    return Sensor(name, **{field: frozen(value) for field, value in values.items()})
+    """The sensor of an entry of `calibrated_sensors.json`. Values are in its groups, the dictionaries of an entry."""
+    values: dict[str, Any] = {}
+    for group in entry.values():
+        if isinstance(group, dict):
+            values |= {field: frozen(value) for field, value in group.items()}
+    return Sensor(name, **values)
 
 
 SENSORS: dict[str, Sensor] = {
@@ -66,22 +69,24 @@ SENSORS: dict[str, Sensor] = {
 
 
 def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
-    """Sensor `number` of a world: the same each time.
+    """Random sensor `number` of a world, the same at each call.
 
     Args:
         seed: Of the world.
         number: Of the sensor, >= 0.
-        near: Side of a view, mm, up to 100, that its own differs from by at most an eighth; drawn as well if left out.
+        near: Side of a view, mm, up to 100, from which the sensor's own differs by at most an eighth. If it is left
+            out, the view is random.
 
     Returns:
         A sensor with two to six lights, white to saturated, 10 to 60 degrees above a gel of 0.8 to 4 mm, flat or
-        bulging, of which the camera sees 10 to 20 mm before a background of its own; markers in a quarter of them. In
-        most the gel lies against what touches it and is drawn along beside it, in the others it spreads all contact.
+        bulging. Its camera has a view of 10 to 20 mm and a random background; a quarter of the sensors have markers. In
+        two thirds the gel follows the surface where they touch, in the others it spreads all contact.
 
     Raises:
-        InvalidInputError, InvalidTypeError: On numbers that are negative, or none, or a view beyond its range.
+        InvalidInputError, InvalidTypeError: If a number is negative, no integer, or a view is out of range.
     """
-    check_integer("seed", seed, 0), check_integer("number", number, 0)
+    check_integer("seed", seed, 0)
+    check_integer("number", number, 0)
     if near is not None:
         check_number("near", near, 1.0, 100.0)
     rng = generator(seed, DRAWN_SENSOR_STREAM, number)
@@ -91,9 +96,9 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     hues = rng.uniform() + (np.arange(lights) + rng.uniform(-0.15, 0.15, lights)) / lights
     colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights))
     colours = colours * rng.uniform(0.6, 1.0, (lights, 1))
-    view = log_uniform(rng, 10.0, 20.0)
-    nearly = float(rng.uniform(0.88, 1.125))
-    view = view if near is None else near * nearly
+    random_view = log_uniform(rng, 10.0, 20.0)
+    view_factor = float(rng.uniform(0.88, 1.125))
+    view = random_view if near is None else near * view_factor
     follows = rng.uniform() < 0.65
     uneven = rng.uniform(0.0, 0.5)
     pitch = float(rng.uniform(1.2, 3.2)) if rng.uniform() < 0.25 else 0.0
@@ -124,30 +129,33 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
 
 def _rgb(hue: np.ndarray, saturation: np.ndarray) -> np.ndarray:
     """Colours (N, 3) of hues, in turns, and saturations, both (N,)."""
-    wheel = np.clip(np.abs((hue[:, None] + np.array([0.0, 2.0, 1.0]) / 3.0) % 1.0 * 6.0 - 3.0) - 1.0, 0.0, 1.0)
-    return 1.0 - saturation[:, None] * (1.0 - wheel)
+    turns = (hue[:, None] + np.array([0.0, 2.0, 1.0]) / 3.0) % 1.0
+    pure = np.clip(np.abs(turns * 6.0 - 3.0) - 1.0, 0.0, 1.0)
+    return 1.0 - saturation[:, None] * (1.0 - pure)
 
 
 def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """An untouched gel (3, 12, 12): a base colour, a glow from each light and in the middle, and a vignette."""
+    """A random untouched gel (3, 12, 12): a base colour, a glow from each light and in the middle, a vignette."""
     axis = (np.arange(12) + 0.5) / 12 * 2.0 - 1.0
     x = axis[None, :]
     y = axis[:, None]
     field = rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) * np.ones((3, 12, 12))
     glow = rng.uniform(0.0, 0.45)
     for azimuth, colour in zip(np.radians(azimuths), colours, strict=True):
-        out = rng.uniform(0.4, 1.3)
+        radius = rng.uniform(0.4, 1.3)
         width = rng.uniform(0.4, 1.2)
-        lobe = np.exp(-((x - out * np.cos(azimuth)) ** 2 + (y - out * np.sin(azimuth)) ** 2) / width**2)
+        distance2 = (x - radius * np.cos(azimuth)) ** 2 + (y - radius * np.sin(azimuth)) ** 2
+        lobe = np.exp(-distance2 / width**2)
         field = field + glow * rng.uniform(0.3, 1.0) * (colour - 0.4)[:, None, None] * lobe
-    cx = rng.uniform(-0.3, 0.3)
-    cy = rng.uniform(-0.3, 0.3)
+    centre_x = rng.uniform(-0.3, 0.3)
+    centre_y = rng.uniform(-0.3, 0.3)
     width = rng.uniform(0.4, 1.2)
-    middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
+    middle = np.exp(-((x - centre_x) ** 2 + (y - centre_y) ** 2) / width**2)
     field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
     field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))
     if rng.uniform() < 0.2:  # dark edges on some sides
         shade = rng.uniform(0.2, 0.8)
         for edge in (field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
-            edge *= shade if rng.uniform() < 0.6 else 1.0
+            if rng.uniform() < 0.6:
+                edge *= shade
     return np.clip(field, 0.04, 0.92).astype(np.float32)
