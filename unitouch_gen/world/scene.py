@@ -1,4 +1,4 @@
-"""The world: names of contacts in, the modalities asked for out."""
+"""The world: renders the modalities of contacts by their names."""
 
 import math
 from collections.abc import Sequence
@@ -30,47 +30,47 @@ from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.scans import scanned_surfaces, with_scans
 from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
-from unitouch_gen.world.surfaces import pictures, surfaces
+from unitouch_gen.world.surfaces import Surfaces, pictures, surfaces
 
 MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
 
-YIELD = 0.75  # share of an overlap that an object as compliant as the gel takes up: it is flattened
+YIELD = 0.75  # share of an overlap by which an object as compliant as the gel is flattened
 
 
 @dataclass
 class Scene:
-    """The modalities that were asked for; the others stay `None` or empty."""
+    """The rendered modalities of N contacts; the others are `None` or empty."""
 
-    material: Tensor  # names of the N contacts, int64 (N,)
+    material: Tensor  # numbers of materials, objects and contacts, which name the N contacts, int64 (N,)
     object: Tensor
     contact: Tensor
-    surface: list[str | None] = field(default_factory=list)  # names of scanned surfaces; `None` where objects are drawn
+    surface: list[str | None] = field(default_factory=list)  # names of scanned surfaces; `None` for drawn ones
     image: Tensor | None = None  # pictures in [0, 1], (N, 3, S, S)
     touch: dict[str, Tensor] = field(default_factory=dict)  # by sensor, touch images in [0, 1], (N, 3, S, S)
     depth: dict[str, Tensor] = field(default_factory=dict)  # by sensor, displacement of the gel in view, mm, (N, S, S)
     audio: Tensor | None = None  # impact sounds in [-1, 1] at 16 kHz, (N, T)
-    recording: list[str | None] = field(default_factory=list)  # names of recorded hits; `None` of synthesised sounds
+    recording: list[str | None] = field(default_factory=list)  # names of recorded hits; `None` for synthesised sounds
     text: list[str] | None = None  # N captions
-    grasp: Tensor | None = None  # force that two fingers carry over the object's weight, (N,): above 1 they lift it
+    grasp: Tensor | None = None  # force that two fingers carry over the object's weight, (N,); above 1 they lift it
     attributes: dict[str, Tensor] = field(default_factory=dict)  # by sensor, (N, 13); see `ATTRIBUTES`
-    left_out: list[str] = field(default_factory=list)  # what the request did not need and was not computed
+    left_out: list[str] = field(default_factory=list)  # what was not needed and not computed
 
 
 class World:
     """A procedural visuo-tactile world, deterministic by seed.
 
     Args:
-        seed: Names the whole world; other seeds have other objects.
+        seed: Of the whole world; other seeds have other objects.
         image_size: Side of pictures and touch images, pixels.
-        scanned: Share of objects that show a scanned surface in place of a drawn one, where their material has some.
-            At 1, all of these do. Objects to train on show other surfaces than those held out.
-        photographic: Share of pictures that are taken as people take photos: see `photographed`.
-        recordings: Share of sounds that are recorded hits in place of synthesised ones, where their material has some.
-            Above 0, all sounds are stored as files are, too: some clipped, some through a codec.
-        colours_alone: Whether surfaces of which only colours are known are among the scanned. They feel flat.
+        scanned: Share of objects with a scanned surface in place of a drawn one, of materials that have some. At 1, all
+            of these objects are scanned. Training objects have other surfaces than those held out.
+        photographic: Share of pictures that look like photos by people; see `photographed`.
+        recordings: Share of sounds that are recorded hits in place of synthesised ones, of materials that have some.
+            Above 0, all sounds go through a file, too: some are clipped, some compressed.
+        colours_alone: Whether scans without heights are used. They feel flat.
 
     Raises:
-        InvalidInputError, InvalidTypeError: On a number out of range.
+        InvalidInputError, InvalidTypeError: If a number is out of range.
 
     Example:
         >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], modalities=("touch", "text"))
@@ -78,7 +78,7 @@ class World:
         (torch.Size([2, 3, 128, 128]), True)
     """
 
-    take = 0  # another number takes other photos of the same contacts
+    take = 0  # other numbers take other photos of the same contacts
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class World:
         self.recordings = check_number("recordings", recordings, 0.0, 1.0)
         self.colours_alone = check_kind("colours_alone", colours_alone, bool)
         self.image_size = check_integer("image_size", image_size, 1, 4096)
-        # Pixels a side of surfaces: a multiple of the picture's, twice as many at least.
+        # Pixels along a side of surfaces: a multiple of the picture's, at least twice as many.
         self.resolution = image_size * max(2, math.ceil(BASE_RESOLUTION / image_size))
 
     @torch.no_grad()
@@ -109,79 +109,96 @@ class World:
         modalities: Sequence[str] = ("image", "touch", "audio", "text"),
         sensors: Sequence[str | Sensor] = ("gelsight",),
     ) -> Scene:
-        """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
+        """Renders N contacts in some modalities and sensors, and computes nothing else.
 
         Args:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
             modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "attributes".
-            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes, and for grasp, which uses
-                the first.
+            sensors: Names in `SENSORS`, or sensors; used for touch, depth and attributes. Grasps use the first.
 
         Raises:
             InvalidTypeError: If names of contacts are no integers, modalities or sensors no list.
-            InvalidInputError: On an unknown modality, sensor or material, or names that are not (N,), or not as many.
+            InvalidInputError: If a modality, sensor or material is unknown, or names are not (N,), or not as many.
         """
         # 1. Check, and draw the numbers of the contacts.
-        asked = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
-        by = _sensors(sensors)
+        requested = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
+        sensor_list = _sensors(sensors)
         material = _numbers("material", material, most=len(MATERIALS) - 1)
         object = _numbers("object", object, len(material))
         contact = _numbers("contact", contact, len(material))
         draws = self.draw(material, object, contact)
-        names = [scanned_surfaces()[number].name if number >= 0 else None for number in draws.surface.tolist()]
-        scene = Scene(material, object, contact, names)
-        scene.left_out = [name for name in MODALITIES if name not in asked]
+        scan_names = [scanned_surfaces()[number].name if number >= 0 else None for number in draws.surface.tolist()]
+        scene = Scene(material, object, contact, surface=scan_names)
+        scene.left_out = [name for name in MODALITIES if name not in requested]
 
-        # 2. Surfaces and their pictures.
-        coloured = "image" in asked
-        size = self.image_size
-        if asked - {"audio", "text"}:
-            built = surfaces(self.seed, draws, self.resolution, coloured=coloured)
-            # Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
-            stiff = 1.0 - YIELD * draws.compliance
-            height = built.height * stiff[:, None, None]
-            depth = draws.indentation_depth * stiff
-            scene.left_out += [] if coloured else ["colours of surfaces"]
+        # 2. Surfaces, their pictures, and gels.
+        coloured = "image" in requested
+        if requested - {"audio", "text"}:
+            patches = surfaces(self.seed, draws, self.resolution, coloured=coloured)
+            if coloured:
+                scene.image = self._pictures(patches, draws)
+            else:
+                scene.left_out.append("colours of surfaces")
+            self._press(scene, patches, draws, sensor_list, requested)
         else:
             scene.left_out.append("surfaces")
-        if coloured:
-            scene.image = pictures(built, draws.light, draws.gloss, draws.white, draws.camera, size)
-            if self.photographic:
-                scene.image = photographed(self.seed, draws.names(), scene.image, self.photographic, self.take)
 
-        # 3. Gels.
-        for sensor in by if asked & {"touch", "depth", "attributes"} else ():
-            indentation = gel_indentation(height, depth, sensor, size)
-            if asked & {"touch", "depth"}:
-                displacement = gel_displacement(indentation, draws.dwell, sensor, size)
-            if "touch" in asked:
-                scene.touch[sensor.name] = self._noisy(gel_image(displacement, sensor, size), draws, sensor)
-            if "depth" in asked:
-                scene.depth[sensor.name] = in_view(displacement, size)
-            if "attributes" in asked:
-                pressed = in_view(indentation, size)
-                view = sensor.field_of_view
-                scene.attributes[sensor.name] = contact_attributes(pressed, view, draws.compliance)
-
-        # 4. Grasps, sounds and captions.
-        if "grasp" in asked:
-            touched = in_view(gel_indentation(height, depth, by[0], size), size) > 0
-            share = touched.float().mean(dim=(-2, -1))
-            scene.grasp = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
-        if "audio" in asked:
+        # 3. Sounds and captions.
+        if "audio" in requested:
             scene.audio = self._sounds(draws)
-            names = [recording_of(self.seed, name, self.recordings) for name in draws.names()]
-            scene.recording = [recording.name if recording else None for recording in names]
-        if "text" in asked:
+            hits = [recording_of(self.seed, name, self.recordings) for name in draws.names()]
+            scene.recording = [hit.name if hit else None for hit in hits]
+        if "text" in requested:
             scene.text = described(draws)
         return scene
+
+    def _pictures(self, patches: Surfaces, draws: Draws) -> Tensor:
+        """Pictures (N, 3, S, S), a share of them as photos."""
+        images = pictures(
+            patches,
+            light=draws.light,
+            gloss=draws.gloss,
+            white=draws.white,
+            side=draws.camera,
+            resolution=self.image_size,
+        )
+        if self.photographic:
+            return photographed(self.seed, draws.names(), images, share=self.photographic, take=self.take)
+        return images
+
+    def _press(self, scene: Scene, patches: Surfaces, draws: Draws, sensors: list[Sensor], requested: set[str]) -> None:
+        """Adds the requested touch images, depths, attributes and grasps to a scene."""
+        size = self.image_size
+        # A soft object and the gel are two springs in series, so all of their overlap shrinks by one factor.
+        stiffness = 1.0 - YIELD * draws.compliance
+        height = patches.height * stiffness[:, None, None]
+        depth = draws.indentation_depth * stiffness
+        if requested & {"touch", "depth", "attributes"}:
+            for sensor in sensors:
+                indentation = gel_indentation(height, depth, sensor, size)
+                if requested & {"touch", "depth"}:
+                    displacement = gel_displacement(indentation, draws.dwell, sensor, size)
+                if "touch" in requested:
+                    scene.touch[sensor.name] = self._noisy(gel_image(displacement, sensor, size), draws, sensor)
+                if "depth" in requested:
+                    scene.depth[sensor.name] = in_view(displacement, size)
+                if "attributes" in requested:
+                    scene.attributes[sensor.name] = contact_attributes(
+                        in_view(indentation, size), sensor.field_of_view, draws.compliance
+                    )
+        if "grasp" in requested:
+            touched = in_view(gel_indentation(height, depth, sensors[0], size), size) > 0
+            share = touched.float().mean(dim=(-2, -1))
+            scene.grasp = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
         """Numbers of N contacts named by three int64 tensors (N,)."""
         draws = draw(self.seed, material, object_, contact)
-        return with_scans(self.seed, draws, self.scanned, self.colours_alone) if self.scanned else draws
+        if self.scanned:
+            return with_scans(self.seed, draws, self.scanned, self.colours_alone)
+        return draws
 
     def _sounds(self, draws: Draws) -> Tensor:
         """Sounds (N, T) through a microphone in a room."""
@@ -203,25 +220,28 @@ class World:
 def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, share: Tensor) -> Tensor:
     """Force that two fingers carry over the object's weight (N,), at a depth in mm and a share of the gel in contact.
 
-    Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth and share. Above 1 they lift, as
-    about two of three do at 3 N for each mm.
+    By Coulomb's law two fingers carry 2 mu F, with a normal force F of 3 N for each mm of depth and full contact. Above
+    1 they lift the object, which is so for about two of three contacts.
     """
     return 2.0 * friction * (3.0 * indentation_depth * share) / weight
 
 
 def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
-    """Sensors by name, or as they are; each once."""
-    given = check_kind("sensors", sensors, list, tuple)
-    found = [one if isinstance(one, Sensor) else SENSORS[check_choice("sensors", one, SENSORS)] for one in given]
-    named = {sensor.name: sensor for sensor in found}
-    if len(named) != max(len(set(found)), 1):
+    """Sensors by name, or as they are, without repeats."""
+    resolved = list[Sensor]()
+    for sensor in check_kind("sensors", sensors, list, tuple):
+        if not isinstance(sensor, Sensor):
+            sensor = SENSORS[check_choice("sensors", sensor, SENSORS)]
+        resolved.append(sensor)
+    by_name = {sensor.name: sensor for sensor in resolved}
+    if not resolved or len(by_name) != len(set(resolved)):
         raise InvalidInputError("`sensors` is empty or holds two of one name; pass some, such as ['gelsight'].")
-    return list(named.values())
+    return list(by_name.values())
 
 
 def _numbers(label: str, values: Any, count: int | None = None, most: int = 2**63 - 1) -> Tensor:
-    """One part of the names of N contacts, int64 (N,), from 0 to `most`."""
-    given = values.tolist() if hasattr(values, "tolist") else values
-    if not isinstance(given, Sequence) or len(given) != (count or max(len(given), 1)):
+    """One part of the names of contacts, int64 (N,), from 0 to `most`; N is `count`, or at least 1."""
+    numbers = values.tolist() if hasattr(values, "tolist") else values
+    if not isinstance(numbers, Sequence) or len(numbers) != (count or max(len(numbers), 1)):
         raise InvalidInputError(f"`{label}` is {describe(values)}; pass an integer for each contact, such as [3].")
-    return torch.tensor([check_integer(label, number, 0, most) for number in given])
+    return torch.tensor([check_integer(label, number, 0, most) for number in numbers])

@@ -1,4 +1,4 @@
-"""Impact sounds by modal synthesis, in closed form, and the rooms and microphones that they are heard through.
+"""Impact sounds by modal synthesis, in closed form, and the response of rooms and microphones.
 
 Each mode is the impulse response of q'' + 2 a q' + w^2 q = delta(t). Modes at or above the Nyquist frequency fade out
 instead of folding back.
@@ -43,7 +43,7 @@ def impulse_response(angular_frequency: Tensor, decay: Tensor, time: Tensor) -> 
 
 
 def impact_sounds(seed: int, draws: Draws) -> Tensor:
-    """Sounds of N impacts in the world of a seed, (N, T), with a peak of 0.9; silence where no mode can be heard."""
+    """Sounds of N impacts in the world of a seed, (N, T), with a peak of 0.9; silence if no mode is audible."""
     time = torch.arange(SAMPLES, dtype=torch.float32) / SAMPLE_RATE
     share = draws.noise[:, None]
     sound = (1.0 - share) * _unit_peak(modal_sounds(draws, time))
@@ -57,27 +57,29 @@ def modal_sounds(draws: Draws, time: Tensor) -> Tensor:
     fundamental = draws.of_material("fundamental")[:, None] * draws.pitch
     decay = draws.decay[:, None] * order**0.7
     frequency = fundamental * order ** draws.inharmonicity[:, None]
-    # A soft strike excites few partials. |sin(i phi)| is mode i's shape at the place struck, phi from 0.6 to 2.1 rad;
-    # 0.15 keeps a mode struck at its node just audible. These and the exponents are chosen, not measured.
+    # A soft strike excites few partials. |sin(i phi)| is the shape of mode i at the place of the strike, phi from 0.6
+    # to 2.1 rad; 0.15 keeps a mode that is struck at its node just audible. These and the exponents are chosen, not
+    # measured.
     roll_off = torch.exp(-0.9 * (1.0 - draws.strike[:, None]) * (order - 1.0))
     place = torch.sin(order * (0.35 + 0.9 * draws.place[:, None]) * 1.7).abs() + 0.15
     below_nyquist = ((0.5 * SAMPLE_RATE - frequency) / (0.1 * SAMPLE_RATE)).clamp(0.0, 1.0)  # fades from 80 % of it on
     amplitude = roll_off * place / order**0.6 * below_nyquist
     sound = torch.zeros(len(draws), len(time))
     for mode in range(MODES):
-        heard = torch.nonzero(amplitude[:, mode] > 1e-3 * amplitude.amax(dim=1))[:, 0]  # -60 dB
-        w, a, gain = (values[heard, mode, None] for values in (2 * torch.pi * frequency, decay, amplitude))
-        sound[heard] += gain * impulse_response(w, a, time[None, :])
+        audible = torch.nonzero(amplitude[:, mode] > 1e-3 * amplitude.amax(dim=1))[:, 0]  # above -60 dB
+        w = 2 * torch.pi * frequency[audible, mode, None]
+        response = impulse_response(w, decay[audible, mode, None], time[None, :])
+        sound[audible] += amplitude[audible, mode, None] * response
     return sound
 
 
 def grain_noise(seed: int, draws: Draws, samples: int) -> Tensor:
     """Band-passed noise under an envelope of colliding grains, each an exact exponential, (N, samples).
 
-    Both convolutions are padded to twice the clip, so nothing wraps from its end to its start, and grains that arrive
-    after the end are not heard: but for the band-pass's reach at the end, a longer clip begins with the same sound.
+    Both convolutions are padded to twice the clip, so nothing wraps from its end to its start. Grains that arrive after
+    the end are left out. So a longer clip begins with the same sound, up to the reach of the band-pass at the end.
     """
-    rows = []
+    rows = list[np.ndarray]()
     time = np.arange(samples, dtype=np.float32) / np.float32(SAMPLE_RATE)
     hz = np.fft.rfftfreq(2 * samples, 1.0 / SAMPLE_RATE)
     for name, centre, grains in zip(draws.names(), draws.noise_centre.tolist(), draws.grains.tolist(), strict=True):
@@ -85,9 +87,9 @@ def grain_noise(seed: int, draws: Draws, samples: int) -> Tensor:
         arrivals = rng.exponential(0.09, 1 + rng.poisson(grains))  # after the strike, s
         strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
         index = (arrivals * SAMPLE_RATE).astype(int)
-        heard = index < samples
+        in_clip = index < samples
         impulses = np.zeros(samples, np.float32)
-        np.add.at(impulses, index[heard], strength[heard])
+        np.add.at(impulses, index[in_clip], strength[in_clip])
         impulses[0] += 1.0  # the strike itself
         tail = np.exp(-time * (40.0 + 0.12 * centre))
         spectrum = np.fft.rfft(impulses, 2 * samples) * np.fft.rfft(tail, 2 * samples)
@@ -105,31 +107,45 @@ def _unit_peak(sound: Tensor) -> Tensor:
 
 
 def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor) -> Tensor:
-    """Sounds (N, T) with a peak of 0.9 as a microphone in a room records them, with peaks 0 to 20 dB below it.
+    """Sounds (N, T) with a peak of 0.9, as recorded by a microphone in a room, with peaks 0 to 20 dB below it.
 
-    Room and microphone are drawn for each name (material, object, contact). The sound comes up to 20 ms late, with
+    Room and microphone are drawn for each name (material, object, contact). The sound is delayed by up to 20 ms, with
     echoes within 60 ms more and noise 25 to 60 dB below its peak. The microphone cuts off below 20 to 150 Hz and above
-    4 to 8 kHz at 12 dB an octave, and tilts what is between by up to 2 dB an octave. These ranges are chosen, not
+    4 to 8 kHz at 12 dB an octave, and tilts the band between by up to 2 dB an octave. These ranges are chosen, not
     measured.
     """
     samples = sounds.shape[1]
     hz = np.fft.rfftfreq(2 * samples, 1.0 / SAMPLE_RATE)  # twice the clip, so nothing wraps from its end to its start
-    rows = []
+    rows = list[np.ndarray]()
     for name, sound in zip(names, sounds.numpy(), strict=True):
         rng = generator(seed, ROOM_STREAM, *name, 1)
-        wave = -2j * np.pi * hz
-        delays = rng.uniform(0.001, 0.06, 4)
-        wet = math.exp(rng.uniform(math.log(0.02), math.log(0.4)))
-        room = rng.uniform(0.005, 0.05)
-        gains = wet * rng.normal(size=4) * np.exp(-delays / room)
-        room_response = np.exp(wave * rng.uniform(0.0, 0.02)) * (1.0 + np.exp(np.outer(wave, delays)) @ gains)
-        low = math.exp(rng.uniform(math.log(20.0), math.log(150.0)))
-        high = rng.uniform(4000.0, 8000.0)
-        tilt = rng.uniform(-2.0, 2.0) / (20.0 * math.log10(2.0))
-        microphone = np.maximum(hz, 1.0) / 1000.0
-        microphone = microphone**tilt / np.sqrt((1.0 + (low / np.maximum(hz, 1.0)) ** 4) * (1.0 + (hz / high) ** 4))
-        floor, level = (10.0 ** (rng.uniform(*decibels) / 20.0) for decibels in ((-60.0, -25.0), (-20.0, 0.0)))
-        noise = np.fft.rfft(floor * PEAK * rng.standard_normal(samples, dtype=np.float32), 2 * samples)
-        heard = np.fft.irfft((np.fft.rfft(sound, 2 * samples) * room_response + noise) * microphone)[:samples]
-        rows.append((level * PEAK / max(np.abs(heard).max(), 1e-12) * heard).astype(np.float32))
+        room = _room_response(rng, hz)
+        microphone = _microphone_response(rng, hz)
+        noise_level = 10.0 ** (rng.uniform(-60.0, -25.0) / 20.0)
+        level = 10.0 ** (rng.uniform(-20.0, 0.0) / 20.0)
+        noise = np.fft.rfft(noise_level * PEAK * rng.standard_normal(samples, dtype=np.float32), 2 * samples)
+        spectrum = (np.fft.rfft(sound, 2 * samples) * room + noise) * microphone
+        recording = np.fft.irfft(spectrum)[:samples]
+        rows.append((level * PEAK / max(np.abs(recording).max(), 1e-12) * recording).astype(np.float32))
     return torch.from_numpy(np.stack(rows))
+
+
+def _room_response(rng: np.random.Generator, hz: np.ndarray) -> np.ndarray:
+    """Frequency response of a random room: a delay, and four echoes that fade."""
+    wave = -2j * np.pi * hz
+    delays = rng.uniform(0.001, 0.06, 4)
+    wetness = math.exp(rng.uniform(math.log(0.02), math.log(0.4)))
+    fading = rng.uniform(0.005, 0.05)  # s
+    gains = wetness * rng.normal(size=4) * np.exp(-delays / fading)
+    echoes = np.exp(np.outer(wave, delays)) @ gains
+    return np.exp(wave * rng.uniform(0.0, 0.02)) * (1.0 + echoes)
+
+
+def _microphone_response(rng: np.random.Generator, hz: np.ndarray) -> np.ndarray:
+    """Frequency response of a random microphone: a tilted band between two cut-offs."""
+    low = math.exp(rng.uniform(math.log(20.0), math.log(150.0)))
+    high = rng.uniform(4000.0, 8000.0)
+    tilt = rng.uniform(-2.0, 2.0) / (20.0 * math.log10(2.0))
+    above_zero = np.maximum(hz, 1.0)
+    cut_off = np.sqrt((1.0 + (low / above_zero) ** 4) * (1.0 + (hz / high) ** 4))
+    return (above_zero / 1000.0) ** tilt / cut_off

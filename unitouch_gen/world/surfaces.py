@@ -1,4 +1,4 @@
-"""Surfaces: bodies covered by the relief of their material, their colours, and pictures of them."""
+"""Surfaces of contacts: bodies covered by the relief of their material, their colours, and pictures of them."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ from unitouch_gen.world.materials import MATERIALS, Material
 from unitouch_gen.world.reliefs import Fields, relief, turned
 from unitouch_gen.world.scans import scanned_patches
 
-DEEPEST_GROUND = -8.0  # height of what lies behind a body, mm
-GAMMA = 1.8  # of the pictures: like the weights of their light chosen for materials to look apart, not measured
+DEEPEST_GROUND = -8.0  # height of the background behind a body, mm
+GAMMA = 1.8  # of the pictures; like the weights of light, it is chosen to make materials distinct, not measured
 
 
 @dataclass
@@ -22,12 +22,12 @@ class Surfaces:
     """N square patches of surface."""
 
     height: Tensor  # toward the sensor and the camera, mm, (N, R, R); the top of the body is near 0
-    albedo: Tensor | None  # linear RGB reflectance in [0, 1], (N, 3, R, R); `None` where only shapes were asked for
-    body: Tensor  # 1 where there is an object, 0 where the background shows behind it, (N, R, R)
+    albedo: Tensor | None  # linear RGB reflectance in [0, 1], (N, 3, R, R); `None` without colours
+    body: Tensor  # 1 on an object, 0 on the background, (N, R, R)
 
 
 def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True) -> Surfaces:
-    """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
+    """Builds the patches of N contacts at `resolution` pixels a side, with colours or without."""
     axis = pixel_axis(resolution)
     x = axis[None, None, :]
     y = axis[None, :, None]
@@ -38,34 +38,37 @@ def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True)
         size = draws.shape_radius[rows, None, None]
         numbers = draws.proportions[rows, :, None, None]
         height[rows] = body(list(SHAPES)[index], u[rows], v[rows], size, numbers)
-    there = (height > DEEPEST_GROUND).float()
+    is_body = (height > DEEPEST_GROUND).float()
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
     raised = torch.zeros(len(draws), resolution, resolution)
-    albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
-    drawn = draws.surface < 0
-    if not drawn.all():
-        rows = torch.nonzero(~drawn)[:, 0]
+    albedo = None
+    if coloured:
+        albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone()
+    is_drawn = draws.surface < 0
+    if not is_drawn.all():
+        rows = torch.nonzero(~is_drawn)[:, 0]
         raised[rows], colours = scanned_patches(draws, rows, resolution, coloured=coloured)
         if albedo is not None:
             albedo[rows] = colours
-    for index in draws.material[drawn].unique().tolist():
+    for index in draws.material[is_drawn].unique().tolist():
         material = MATERIALS[index]
-        rows = torch.nonzero(drawn & (draws.material == index))[:, 0]
+        rows = torch.nonzero(is_drawn & (draws.material == index))[:, 0]
         raised[rows], shade = relief(material.name, Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)
-    level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # that lies level with the body
-    height = torch.where(there > 0, height + raised - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
-    return Surfaces(height, albedo, there)
+    level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # of the relief, put at the body's height
+    height = torch.where(is_body > 0, height + raised - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
+    return Surfaces(height, albedo, is_body)
 
 
 def shaded(material: Material, colour: Tensor, shade: Tensor) -> Tensor:
-    """(N, 3, R, R): the base colour, mixed toward the second (or toward black) where the shade is negative."""
+    """(N, 3, R, R): the base colour, mixed toward the second colour (or toward black) where the shade is negative."""
     base = colour[:, :, None, None]
     shade = shade.clamp(-1.2, 1.2)[:, None]
     dark = 0.35 * base if material.second is None else torch.tensor(material.second)[:, None, None]
-    below = material.contrast * (0.5 - 0.5 * shade).clamp(0.0, 1.0)
-    return (base * (1.0 - below) + dark * below + 0.08 * material.contrast * shade.clamp_min(0.0)).clamp(0.0, 1.0)
+    weight = material.contrast * (0.5 - 0.5 * shade).clamp(0.0, 1.0)
+    mixed = base * (1.0 - weight) + dark * weight
+    return (mixed + 0.08 * material.contrast * shade.clamp_min(0.0)).clamp(0.0, 1.0)
 
 
 def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: Tensor, resolution: int) -> Tensor:
@@ -76,26 +79,29 @@ def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: 
         light: Unit vectors toward the lamp, (N, 3).
         gloss: Weight of the highlight, (N,).
         white: White balance of the camera, factors on RGB, (N, 3).
-        side: Of what it sees about the middle of the surface, mm, (N,).
+        side: Of the view, about the middle of the surface, mm, (N,).
         resolution: Side S of the picture, pixels; R must be a multiple of it.
     """
-    assert seen.albedo is not None  # as they are coloured
+    assert seen.albedo is not None  # they are coloured
     padded = F.pad(seen.height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    slope_x, slope_y = (field[:, 1:-1, 1:-1] for field in slopes(padded, PATCH_MM / seen.height.shape[-1]))
+    slope_x, slope_y = slopes(padded, PATCH_MM / seen.height.shape[-1])
+    slope_x = slope_x[:, 1:-1, 1:-1]
+    slope_y = slope_y[:, 1:-1, 1:-1]
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
     lx, ly, lz = (component[:, None, None] for component in light.unbind(1))
     lambert = ((lz - lx * slope_x - ly * slope_y) * normal).clamp_min(0.0)
-    # Blinn's half vector between lamp and camera (0, 0, 1), and an exponent of 48 by squaring, which is the fastest.
+    # Blinn's half vector between lamp and camera (0, 0, 1), with an exponent of 48 by repeated squaring.
     half = torch.rsqrt(2.0 + 2.0 * lz)
     facing = (((1.0 + lz) - lx * slope_x - ly * slope_y) * normal * half).clamp(0.0, 1.0)
     for _ in range(4):
         facing = facing.square()
     highlight = gloss[:, None, None] * facing**3
-    lit = seen.albedo * (0.38 + 0.72 * lambert)[:, None]  # of the sky and the lamp; what follows writes in place
+    lit = seen.albedo * (0.38 + 0.72 * lambert)[:, None]  # by the sky and the lamp
     lit += 0.35 * highlight[:, None]
-    behind = torch.tensor((0.20, 0.21, 0.24))[None, :, None, None]
-    linear = torch.lerp(behind, lit, seen.body[:, None]).mul_(white[..., None, None]).clamp_(0.0, 1.0)
-    nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
+    background = torch.tensor((0.20, 0.21, 0.24))[None, :, None, None]
+    linear = torch.lerp(background, lit, seen.body[:, None]).mul_(white[..., None, None]).clamp_(0.0, 1.0)
+    zoom = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    grid = F.affine_grid(zoom, list(linear.shape), align_corners=False)
     linear = F.grid_sample(linear, grid, align_corners=False)
-    return F.avg_pool2d(linear, linear.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)
+    pooled = F.avg_pool2d(linear, linear.shape[-1] // resolution)
+    return pooled.clamp_min(1e-6) ** (1 / GAMMA)
