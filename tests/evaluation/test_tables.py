@@ -9,7 +9,7 @@ from torch import Tensor
 from transformers import ResNetConfig
 
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts
-from unitouch_gen.evaluation.generated import beside_class_means, measures_of, some
+from unitouch_gen.evaluation.generated import beside_class_means, measures_of, sample_per_class
 from unitouch_gen.evaluation.tables import TEMPLATES, grasp_table, material_table, prompts_table, retrieval_table
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.world import ATTRIBUTES
@@ -124,8 +124,8 @@ def test_means_of_classes_are_as_long_as_embeddings():
 def test_a_few_of_each_class_are_spread_over_all_of_it():
     labels = torch.tensor([0] * 9 + [-1] + [2] * 2)
     one = Contacts(np.empty(12), [None] * 12, torch.arange(12), {"material": labels}, {})
-    assert some(one, 3).tolist() == [9, 0, 4, 8, 10, 11]  # of those of unknown class, too
-    assert some(one, 1).tolist() == [9, 0, 10]
+    assert sample_per_class(one, 3).tolist() == [9, 0, 4, 8, 10, 11]  # of those of unknown class, too
+    assert sample_per_class(one, 1).tolist() == [9, 0, 10]
     cover = torch.ones(12, 2, len(ATTRIBUTES))
     cover[9, 1, ATTRIBUTES.index("cover")] = 0.0
-    assert some(replace(one, attributes=cover), 1).tolist() == [0, 10]  # what nothing touches is left out
+    assert sample_per_class(replace(one, attributes=cover), 1).tolist() == [0, 10]  # what nothing touches is left out

@@ -77,7 +77,7 @@ def work_precision(
     reached = (0.2, 0.1, 0.05, 0.02, 0.01)
     table = list[list[str]]()
     for name in names:
-        own = sorted((row for row in wp.good(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
+        own = sorted((row for row in wp.successful(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
         enough = [next((row for row in own if row["error"] <= error), None) for error in reached]
         cells = [f"{wp.amount(row)}, {row['seconds']:.2g} s" if row else "-" for row in enough]
         table.append([name, *(["adds noise"] * len(reached) if name in target.noisy else cells)])

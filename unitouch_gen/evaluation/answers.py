@@ -1,4 +1,4 @@
-"""Answers about touches (Section 4.6 of the paper): the share that is right."""
+"""Accuracy of answers about touches (Section 4.6 of the paper)."""
 
 import re
 from collections import Counter
@@ -11,80 +11,100 @@ from torchmetrics.functional.text import rouge_score
 
 from unitouch_gen.evaluation.contacts import Splits, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import Figures, others
-from unitouch_gen.evaluation.generated import some
+from unitouch_gen.evaluation.generated import sample_per_class
 from unitouch_gen.evaluation.metrics import cosines
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 from unitouch_gen.world.questions import TOPICS
 
 Asked = Mapping[str, tuple[str, Sequence[str]]]
-"""By topic, see `unitouch_gen.world.questions`: a question about a contact, and answers that are true."""
+"""By topic (see `unitouch_gen.world.questions`), a question about a contact and its true answers."""
 
 
 def caption_table(pipe: Any, splits: Splits, embed: Callable[[Sequence[str]], Tensor], each: int) -> dict[str, Figures]:
-    """Shares of answers that are right, of `each` contacts of every material of the split "test", by row.
+    """Accuracy of answers on `each` contacts of every material of the split "test", by row.
 
-    Touches are put in zero-shot; the same is asked of other contacts' touches, and of the pictures. Of hardness and
-    grasps accuracy is balanced over what is true; of grains it is of such as there are. ROUGE-L of captions is that to
-    the nearest true one.
+    Touches are answered zero-shot. The same questions are asked of other contacts' touches, and of pictures. Accuracies
+    of hardness and grasps are balanced over the true classes; that of grains is over contacts with a grain. ROUGE-L of
+    a caption is to the nearest true caption.
 
     Args:
         pipe: A `TouchToTextPipeline`.
-        embed: Gives unit embeddings of texts, for the zero-shot classifier.
+        embed: Returns unit embeddings of texts, for the zero-shot classifier.
     """
     test = splits["test"]
-    names = test.classes.get("material", ())
-    rows = some(test, each)
-    truths = test.asked()
-    before = splits["train"].asked()
-    asked = [truths[row] for row in rows.tolist()]
-    usual = {topic: Counter(one[topic][1][0] for one in before) for topic in asked[0]}
+    materials = test.classes.get("material", ())
+    rows = sample_per_class(test, each)
+    asked_of_test = test.asked()
+    asked = [asked_of_test[row] for row in rows.tolist()]
+    topics = list(asked[0])
     pixels = float_pixels(test.touch[rows.numpy()])
-    known = [test.sensors[row] for row in rows.tolist()]
-    touch = in_batches(len(rows), lambda part: pipe.encode_touch(pixels[part], known[part]))
+    sensors = [test.sensors[row] for row in rows.tolist()]
+    touch = in_batches(len(rows), lambda part: pipe.encode_touch(pixels[part], sensors[part]))
     embeds = {"touch": touch, "shuffled touches": touch[others(len(touch))]}
     if "image" in test.features:
         embeds["picture"] = test.features["image"][rows]
-    answers = {
-        "most frequent answer": {topic: [found.most_common(1)[0][0]] * len(rows) for topic, found in usual.items()}
-    }
-    for row, values in embeds.items():
-        answers[row] = {topic: answered(pipe, values, [one[topic][0] for one in asked]) for topic in asked[0]}
-    figures = {row: measured(asked, found, names) for row, found in answers.items()}
-    if "material" in asked[0]:
-        classes = embed([PROMPTS["touch"].format(name) for name in names])
-        found = cosines(test.features["touch"][rows], classes).argmax(dim=1)
-        figures["zero-shot classifier"] = {"material": float((found == test.material[rows]).double().mean())}
+    most_frequent = most_frequent_answers(splits["train"].asked(), topics)
+    answers = {"most frequent answer": {topic: [answer] * len(rows) for topic, answer in most_frequent.items()}}
+    for name, values in embeds.items():
+        answers[name] = {}
+        for topic in topics:
+            questions = [by_topic[topic][0] for by_topic in asked]
+            answers[name][topic] = answered(pipe, values, questions)
+    figures = {name: measured(asked, by_topic, materials) for name, by_topic in answers.items()}
+    if "material" in topics:
+        classes = embed([PROMPTS["touch"].format(name) for name in materials])
+        predicted = cosines(test.features["touch"][rows], classes).argmax(dim=1)
+        accuracy = float((predicted == test.material[rows]).double().mean())
+        figures["zero-shot classifier"] = {"material": accuracy}
     return figures
 
 
+def most_frequent_answers(asked: Sequence[Asked], topics: Sequence[str]) -> dict[str, str]:
+    """The most frequent true answer of each topic."""
+    answers = dict[str, str]()
+    for topic in topics:
+        counts = Counter(by_topic[topic][1][0] for by_topic in asked)
+        answers[topic], _ = counts.most_common(1)[0]
+    return answers
+
+
 def answered(pipe: Any, embeds: Tensor, questions: Sequence[str]) -> list[str]:
-    """The likeliest answers to a question about each of N embeddings (N, D)."""
-    found = list[str]()
-    for part in [slice(start, start + 64) for start in range(0, len(questions), 64)]:
-        found += pipe(touch_embeds=embeds[part], question=list(questions[part]), do_sample=False).texts
-    return found
+    """The likeliest answer to each of N questions about embeddings (N, D)."""
+    answers = list[str]()
+    for start in range(0, len(questions), 64):
+        batch = slice(start, start + 64)
+        answers += pipe(touch_embeds=embeds[batch], question=list(questions[batch]), do_sample=False).texts
+    return answers
 
 
 def measured(asked: Sequence[Asked], answers: Mapping[str, Sequence[str]], materials: Sequence[str]) -> Figures:
-    """Figures of answers by topic, each to one of the questions that were asked."""
+    """Accuracies of answers by topic, one answer to each of the questions `asked`, and ROUGE-L of captions."""
     figures = Figures()
     for name, topic in TOPICS.items():
         if name not in answers or not topic.figure:
             continue
         words = topic.words or {material: material for material in materials}
-        truths = [class_of(one[name][1][0], words) for one in asked]
-        pairs = list(zip(truths, [class_of(text, words) for text in answers[name]], strict=True))
-        right = {true: [true == said for other, said in pairs if other == true] for true, _ in pairs if true}
-        groups = list(right.values()) if topic.balanced else [[*chain(*right.values())]]
-        figures[topic.figure] = sum(sum(found) / len(found) for found in groups) / len(groups)
+        truths = [class_of(by_topic[name][1][0], words) for by_topic in asked]
+        predicted = [class_of(text, words) for text in answers[name]]
+        figures[topic.figure] = accuracy(truths, predicted, balanced=topic.balanced)
     if "caption" in answers:
-        true = [list(one["caption"][1]) for one in asked]
-        scores = rouge_score(list(answers["caption"]), true, accumulate="best", rouge_keys="rougeL")
+        true_captions = [list(by_topic["caption"][1]) for by_topic in asked]
+        scores = rouge_score(list(answers["caption"]), true_captions, accumulate="best", rouge_keys="rougeL")
         figures["ROUGE-L"] = float(scores["rougeL_fmeasure"])
     return figures
 
 
+def accuracy(truths: Sequence[str | None], predicted: Sequence[str | None], *, balanced: bool) -> float:
+    """Share of right classes among those with a true one, or its mean over the true classes."""
+    right_of: dict[str, list[bool]] = {}
+    for truth, prediction in zip(truths, predicted, strict=True):
+        if truth:
+            right_of.setdefault(truth, []).append(prediction == truth)
+    groups = list(right_of.values()) if balanced else [[*chain(*right_of.values())]]
+    return sum(sum(right) / len(right) for right in groups) / len(groups)
+
+
 def class_of(text: str, words: Mapping[str, str]) -> str | None:
-    """The class that the first of some words in a text stands for; `None` if the text has none of them."""
-    found = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
-    return words[found[0]] if found else None
+    """The class of the first of `words` in a text; `None` if the text has none of them."""
+    match = re.search(rf"\b(?:{'|'.join(map(re.escape, words))})\b", text)
+    return words[match[0]] if match else None

@@ -1,6 +1,6 @@
-"""Table 5 and Section 4.8 of the paper: pictures made of touches, and touches made of anything.
+"""Table 5 and Section 4.8 of the paper: pictures generated from touches, and touches from other modalities.
 
-The classifiers that judge them share no weights with what drew them, nor with what that was conditioned on.
+The classifiers that judge them share no weights with the generators, nor with the encoders of their conditions.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,131 +16,163 @@ from unitouch_gen.evaluation.metrics import correlated, cosines, frechet_distanc
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.world import ATTRIBUTES
 
-Classifiers = Mapping[str, ContactClassifier]  # of "image" and "touch"
+Classifiers = Mapping[str, ContactClassifier]  # by "image" and "touch"
 MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 
 
 def touch_to_image_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
 ) -> dict[str, Figures]:
-    """Table 5: measures of pictures of the test split's touches, with their controls.
+    """Table 5: measures of pictures generated from the test split's touches, with their controls.
 
     Controls are pictures of the mean touch of a class and of another contact, and the real picture of the nearest touch
-    of the training split. The ceiling is the real picture, which the world shows under another lamp. Measures are
-    fitted to the split "train", and `each` contacts of each material of "test" are drawn.
+    of the training split. The ceiling is the real picture, in the world under another lamp. Measures are fitted to the
+    split "train". `each` contacts of each material of "test" are used.
     """
     train = splits["train"]
     test = splits["test"]
-    rows = some(test, each)
+    rows = sample_per_class(test, each)
     embeds = beside_class_means(pipe.encode_touch, "touch", test.touch, test, rows)
-    made = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
+    images = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
     nearest = cosines(test.features["touch"][rows], train.features["touch"]).argmax(dim=1)
-    made["real one of the nearest known touch"] = float_pixels(train.image[nearest.numpy()])
-    made["ceiling"] = float_pixels(test.image[rows.numpy()]) if test.relit is None else test.relit()[rows]
-    return with_controls(measures_of(splits, classifiers, "image", rows), made)
+    images["real one of the nearest known touch"] = float_pixels(train.image[nearest.numpy()])
+    images["ceiling"] = float_pixels(test.image[rows.numpy()]) if test.relit is None else test.relit()[rows]
+    return with_controls(measures_of(splits, classifiers, "image", rows), images)
 
 
 def x_to_touch_table(pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int) -> dict[str, Figures]:
-    """Section 4.8: the same of touches made of pictures, captions, sounds and touches by another sensor.
+    """Section 4.8: the same measures of touches from pictures, captions, sounds and touches by another sensor.
 
-    The ceiling is the real touch, which the world shows by another sensor.
+    The ceiling is the real touch, in the world by another sensor.
     """
     test = splits["test"]
-    figures = dict[str, Figures]()
-    rows = some(test, each)
-    ceiling = float_pixels((test.touch if test.second is None else test.second)[rows.numpy()])
+    rows = sample_per_class(test, each)
+    real = test.touch if test.second is None else test.second
+    ceiling = float_pixels(real[rows.numpy()])
     measure = measures_of(splits, classifiers, "touch", rows)
     sensors = [test.sensors[row] for row in rows.tolist()]
-    inputs = {"image": test.image, "touch": test.second, "audio": test.sounds, "text": test.text or None}
-    for modality in [name for name in pipe.unitouch.known_modalities if inputs[name] is not None]:
-        values: Any = inputs[modality]() if modality == "audio" else inputs[modality]
+    inputs: dict[str, Any] = {
+        "image": test.image,
+        "touch": test.second,
+        "audio": test.sounds,
+        "text": test.text or None,
+    }
+    figures = dict[str, Figures]()
+    for modality in pipe.unitouch.known_modalities:
+        values = inputs[modality]
+        if values is None:
+            continue
+        if modality == "audio":
+            values = values()
         embeds = beside_class_means(pipe.encode_condition, modality, values, test, rows)
-        made = {name: generate(pipe, seed, {"condition_embeds": e, "sensor": sensors}) for name, e in embeds.items()}
-        measured = with_controls(measure, {**made, "ceiling": ceiling})
-        figures |= {f"{MADE_OF[modality]}: {name}": row for name, row in measured.items()}
+        images = dict[str, Tensor]()
+        for name, condition_embeds in embeds.items():
+            images[name] = generate(pipe, seed, {"condition_embeds": condition_embeds, "sensor": sensors})
+        images["ceiling"] = ceiling
+        for name, row in with_controls(measure, images).items():
+            figures[f"{MADE_OF[modality]}: {name}"] = row
     return figures
 
 
-def some(contacts: Contacts, each: int) -> Tensor:
-    """Rows of at most `each` contacts of every material, spread over them; where it is known, of such as touch."""
-    touched = torch.ones(len(contacts.objects), dtype=torch.bool)
+def sample_per_class(contacts: Contacts, each: int) -> Tensor:
+    """Rows of at most `each` contacts of every material, evenly spaced, without contacts that touch nothing."""
+    is_touching = torch.ones(len(contacts.objects), dtype=torch.bool)
     if contacts.attributes is not None:
-        touched = (contacts.attributes[:, :, ATTRIBUTES.index("cover")] > 0.01).all(dim=1)
-    classes = [torch.nonzero((contacts.material == one) & touched)[:, 0] for one in contacts.material.unique()]
-    return torch.cat([rows[torch.linspace(0, len(rows) - 1, each).long().unique()] for rows in classes if len(rows)])
+        is_touching = (contacts.attributes[:, :, ATTRIBUTES.index("cover")] > 0.01).all(dim=1)
+    chosen = list[Tensor]()
+    for material in contacts.material.unique():
+        rows = torch.nonzero((contacts.material == material) & is_touching)[:, 0]
+        if len(rows):
+            places = torch.linspace(0, len(rows) - 1, each).long().unique()
+            chosen.append(rows[places])
+    return torch.cat(chosen)
 
 
 def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) -> Tensor:
-    """An image (N, 3, H, W) for each of N inputs, arguments of the pipeline's call beside its options, in batches."""
+    """An image (N, 3, H, W) for each of N rows of `inputs`, arguments of the pipeline's call, in batches."""
 
     def draw(rows: slice) -> Tensor:
-        part = {name: values[rows] for name, values in inputs.items()}
+        batch = {name: values[rows] for name, values in inputs.items()}
         generator = torch.Generator().manual_seed(1_000 * seed + rows.start // 64)
-        return pipe(**part, **options, generator=generator, output_type="pt").images
+        return pipe(**batch, **options, generator=generator, output_type="pt").images
 
-    return in_batches(len(next(iter(inputs.values()))), draw, 64)
+    count = len(next(iter(inputs.values())))
+    return in_batches(count, draw, size=64)
 
 
 def beside_class_means(
     encode: Callable[..., Tensor], name: str, inputs: Any, contacts: Contacts, rows: Tensor
 ) -> dict[str, Tensor]:
-    """Embeddings of some rows, and if all are labelled the means over their classes, each as long as the row's own."""
-    read: Any = float_pixels if name in ("image", "touch") else lambda values: values
-    embeds = in_batches(len(inputs), lambda part: encode(**{name: read(inputs[part])}))
+    """Embeddings of some rows and, if all are labelled, the means of their classes with the norm of the row's own."""
+
+    def encode_batch(batch: slice) -> Tensor:
+        values = float_pixels(inputs[batch]) if name in ("image", "touch") else inputs[batch]
+        return encode(**{name: values})
+
+    embeds = in_batches(len(inputs), encode_batch)
     if bool((contacts.material < 0).any()):
         return {"value": embeds[rows]}
-    means = F.normalize(class_means(F.normalize(embeds, dim=-1), contacts.material), dim=-1)
-    return {"value": embeds[rows], "class_mean": (means * embeds.norm(dim=-1, keepdim=True))[rows]}
+    directions = F.normalize(class_means(F.normalize(embeds, dim=-1), contacts.material), dim=-1)
+    means = directions * embeds.norm(dim=-1, keepdim=True)
+    return {"value": embeds[rows], "class_mean": means[rows]}
 
 
 def measures_of(splits: Splits, classifiers: Classifiers, modality: str, rows: Tensor) -> Callable[[Tensor], Figures]:
-    """The measures of images (K, 3, H, W) that were made of K rows of the test split.
+    """The measures of images (K, 3, H, W) that were generated for K rows of the test split.
 
-    - "CVTP" (Yang et al., 2023): mean cosine of touches and pictures. The paper trained a network on pairs; here it is
-      the space in which what two classifiers read of the training split's pairs correlates most.
+    - "CVTP" (Yang et al., 2023): mean cosine of touches and pictures. The paper trained a network on pairs. Here the
+      space is that in which readings of two classifiers on the training split's pairs correlate most.
     - "as real": share that is classified as the real image is.
     - "contact": share that is nearest to its own real image among those of a material.
-    - "distance": Frechet's to real images of other contacts.
+    - "distance": Frechet distance to real images of other contacts.
     """
     train = splits["train"]
     test = splits["test"]
-    classifier = classifiers[modality]
     other = "touch" if modality == "image" else "image"
+    classifier = classifiers[modality]
+    other_classifier = classifiers[other]
     real = getattr(test, modality)
-    material = test.material.unique(return_inverse=True)[1]
-    remaining = sorted({*range(len(real))} - {*rows.tolist()})
+    _, material = test.material.unique(return_inverse=True)
+    other_rows = sorted({*range(len(real))} - {*rows.tolist()})
     size = min(64, int(torch.bincount(material).min()))
     gallery, features = read(classifier, real)
     paired = train.image is not None and test.image is not None
     if paired:
-        known = (read(classifiers[other], getattr(train, other))[0], read(classifier, getattr(train, modality))[0])
-        partners = read(classifiers[other], getattr(test, other)[rows.numpy()])[0]
+        other_readings, _ = read(other_classifier, getattr(train, other))
+        own_readings, _ = read(classifier, getattr(train, modality))
+        partners, _ = read(other_classifier, getattr(test, other)[rows.numpy()])
 
-    def named(readings: Tensor) -> Tensor:
+    def material_of(readings: Tensor) -> Tensor:
         return readings[:, : classifier.config.num_labels].argmax(dim=1)
 
     def measure(images: Tensor) -> Figures:
         images = F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True)
-        readings, own_features = read(classifier, images)
-        found = {"as real": share_right(named(readings), named(gallery[rows]))}
+        readings, image_features = read(classifier, images)
+        figures = {"as real": share_right(material_of(readings), material_of(gallery[rows]))}
         if paired:
-            found["CVTP"] = F.cosine_similarity(*correlated("CCA", known, partners, readings, 5)).mean().item()
+            pairs = (other_readings, own_readings)
+            correlates = correlated("CCA", pairs, partners, readings, components=5)
+            figures["CVTP"] = F.cosine_similarity(*correlates).mean().item()
         if size > 1:
-            found[f"contact, among {size}"] = retrieval(readings, gallery, material, rows, size=size)
-        return {**found, "distance": frechet_distance(own_features, features[remaining])}
+            figures[f"contact, among {size}"] = retrieval(readings, gallery, material, rows, size=size)
+        figures["distance"] = frechet_distance(image_features, features[other_rows])
+        return figures
 
     return measure
 
 
 def read(classifier: ContactClassifier, images: Any) -> tuple[Tensor, Tensor]:
-    """What a classifier says of N images: log-probabilities of C materials and K attributes in deviations from their
-    means, (N, C + K), and features (N, D)."""
+    """A classifier's readings of N images, (N, C + K), and features (N, D).
+
+    Readings are log-probabilities of C materials, and K attributes in deviations from their means.
+    """
     mean, deviation = classifier.scale_of_attributes()
 
-    def observe(part: slice) -> Tensor:
-        said: Any = classifier.observe(float_pixels(images[part]))
-        return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation, said.features], dim=1)
+    def observe(batch: slice) -> Tensor:
+        output: Any = classifier.observe(float_pixels(images[batch]))
+        attributes = (output.attributes - mean) / deviation
+        return torch.cat([output.logits.log_softmax(dim=1), attributes, output.features], dim=1)
 
-    found = in_batches(len(images), observe)
+    columns = in_batches(len(images), observe)
     width = int(classifier.config.num_labels or 0) + len(mean)
-    return found[:, :width], found[:, width:]
+    return columns[:, :width], columns[:, width:]

@@ -1,4 +1,4 @@
-"""Metrics of embeddings: retrieval, canonical correlation, and the distance of two sets; linear probes."""
+"""Metrics of embeddings: retrieval, canonical correlation, Frechet distance, and linear probes."""
 
 import warnings
 
@@ -17,15 +17,15 @@ from torch import Tensor
 
 
 def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
-    """Of queries (Q, D) and a gallery (N, D) of any lengths, float64 (Q, N)."""
+    """Cosines of queries (Q, D) and a gallery (N, D), float64 (Q, N)."""
     return F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
 
 
 def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | None = None, *, size: int = 64) -> float:
     """Expected share of queries that are nearest, by cosine, to their own sample among `size`; chance is 1 / size.
 
-    The other `size` - 1 are of the same class, of which none may have fewer. The expectation is over all draws of them,
-    so it has no seed. Samples that are equally near are as likely to come first.
+    The other `size` - 1 samples are of the same class, so no class may have fewer samples. The expectation is over all
+    choices of them, so it has no seed. Ties are broken in all ways with equal probability.
 
     Args:
         queries, gallery: (Q, D) and (N, D).
@@ -34,19 +34,22 @@ def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | N
     """
     rows = torch.arange(len(queries)) if rows is None else rows
     cosine = cosines(queries, gallery)
-    rivals = labels[rows, None] == labels[None, :]  # (Q, N)
-    rivals[torch.arange(len(rows)), rows] = False
+    is_rival = labels[rows, None] == labels[None, :]  # (Q, N)
+    is_rival[torch.arange(len(rows)), rows] = False
     own = cosine.gather(1, rows[:, None])
-    nearer, equal = ((rivals & found).sum(dim=1).tolist() for found in (cosine > own, cosine == own))
-    shares = []
-    for before, ties, count in zip(nearer, equal, rivals.sum(dim=1).tolist(), strict=True):
-        ahead = np.arange(before, before + ties + 1)  # rivals that come first, whichever way ties fall
-        shares.append(hypergeom.cdf(0, count, ahead, size - 1).mean())  # none of them is drawn
-    return float(np.mean(shares))
+    nearer = (is_rival & (cosine > own)).sum(dim=1).tolist()
+    equal = (is_rival & (cosine == own)).sum(dim=1).tolist()
+    rivals = is_rival.sum(dim=1).tolist()
+    probabilities = []
+    for nearer_rivals, ties, count in zip(nearer, equal, rivals, strict=True):
+        ranked_before = np.arange(nearer_rivals, nearer_rivals + ties + 1)  # for every way that ties are broken
+        none_is_chosen = hypergeom.cdf(0, count, ranked_before, size - 1)
+        probabilities.append(none_is_chosen.mean())
+    return float(np.mean(probabilities))
 
 
 def mean_average_precision(queries: Tensor, gallery: Tensor, objects: Tensor) -> float:
-    """Mean average precision of a gallery ranked by cosine; all contacts of a query's object count as found.
+    """Mean average precision of a gallery ranked by cosine; all contacts of a query's object are relevant.
 
     Queries and gallery are (N, D), of the same N contacts (Gao et al., 2023, "The ObjectFolder Benchmark").
     """
@@ -60,55 +63,76 @@ CORRELATED = {"CCA": CCA, "PLSCA": PLSCanonical}  # Hotelling, 1936; Wegelin, 20
 def correlated(
     method: str, pairs: tuple[Tensor, Tensor], queries: Tensor, gallery: Tensor, components: int = 10
 ) -> tuple[Tensor, Tensor]:
-    """Queries (Q, D) and gallery (N, E) in the space in which pairs (M, D) and (M, E) correlate most, K-dimensional.
+    """Queries (Q, D) and gallery (N, E) in the K-dimensional space in which pairs (M, D) and (M, E) correlate most.
 
-    Its components have unit variance over the pairs, so that cosines compare the two.
+    The components have unit variance over the pairs, so that cosines can compare the two.
     """
-    one, other, asked, stored = (part.double().cpu().numpy() for part in (*pairs, queries, gallery))
-    fitted = CORRELATED[method](min(components, one.shape[1], other.shape[1], len(one) - 1), max_iter=500)
+    first = _array(pairs[0])
+    second = _array(pairs[1])
+    dimensions = min(components, first.shape[1], second.shape[1], len(first) - 1)
+    model = CORRELATED[method](dimensions, max_iter=500)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted.fit(one, other)
-    deviations = [side.std(axis=0) for side in fitted.transform(one, other)]
-    # A component that does not vary over the pairs says nothing: it is set to 0.
-    scales = [np.where(each > 1e-9 * each.max(), each, np.inf) for each in deviations]
-    found, found_in = (side / scale for side, scale in zip(fitted.transform(asked, stored), scales, strict=True))
-    return torch.from_numpy(found), torch.from_numpy(found_in)
+        model.fit(first, second)
+    first_pairs, second_pairs = model.transform(first, second)
+    query_components, gallery_components = model.transform(_array(queries), _array(gallery))
+    query_components = query_components / _scale(first_pairs)
+    gallery_components = gallery_components / _scale(second_pairs)
+    return torch.from_numpy(query_components), torch.from_numpy(gallery_components)
+
+
+def _array(features: Tensor) -> np.ndarray:
+    return features.double().cpu().numpy()
+
+
+def _scale(components: np.ndarray) -> np.ndarray:
+    """Deviations of components (M, K); infinite for a component that does not vary, so that it becomes 0."""
+    deviation = components.std(axis=0)
+    return np.where(deviation > 1e-9 * deviation.max(), deviation, np.inf)
 
 
 def frechet_distance(one: Tensor, other: Tensor) -> float:
     """||m1 - m2||^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2)) of features (N, D) and (M, D) (Heusel et al., 2017).
 
-    Distances compare at equal N and M only. torchmetrics' takes images, and a product that is singular where there are
-    fewer samples than features.
+    Distances are comparable at equal N and M only. torchmetrics' function takes images, and its product of covariances
+    is singular if there are fewer samples than features.
     """
-    a, b = (features.double().cpu().numpy() for features in (one, other))
-    # Tr (C1 C2)^(1/2) is the sum of singular values of A B', where A' A = C1 and B' B = C2.
-    first, second = (np.linalg.qr(part - part.mean(axis=0), mode="r") / np.sqrt(len(part) - 1) for part in (a, b))
-    roots = np.linalg.svd(first @ second.T, compute_uv=False)
-    apart = a.mean(axis=0) - b.mean(axis=0)
-    return max(float(apart @ apart + np.square(first).sum() + np.square(second).sum() - 2.0 * roots.sum()), 0.0)
+    first = _array(one)
+    second = _array(other)
+    # Tr (C1 C2)^(1/2) is the sum of the singular values of R1 R2', where R1' R1 = C1 and R2' R2 = C2.
+    first_root = _covariance_root(first)
+    second_root = _covariance_root(second)
+    singular_values = np.linalg.svd(first_root @ second_root.T, compute_uv=False)
+    between = first.mean(axis=0) - second.mean(axis=0)
+    traces = np.square(first_root).sum() + np.square(second_root).sum()
+    return max(float(between @ between + traces - 2.0 * singular_values.sum()), 0.0)
+
+
+def _covariance_root(features: np.ndarray) -> np.ndarray:
+    """R with R' R the covariance of features (N, D)."""
+    centred = features - features.mean(axis=0)
+    return np.linalg.qr(centred, mode="r") / np.sqrt(len(features) - 1)
 
 
 def linear_probe(
     train: Tensor, labels: Tensor, val: Tensor, val_labels: Tensor, test: Tensor, *, balanced: bool = False
 ) -> Tensor:
-    """Classes (N,) of `test` by logistic regression on standardised features, whose penalty `val` chooses (Sec. 4.1).
+    """Classes (N,) of `test` by logistic regression on standardised features; `val` chooses the penalty (Sec. 4.1).
 
-    Features are (M, D), (K, D) and (N, D), labels int64 (M,) and (K,); `balanced` classes weigh alike.
+    Features are (M, D), (K, D) and (N, D), labels int64 (M,) and (K,). With `balanced`, classes have equal weights.
     """
-    strengths = {"logisticregression__C": (1e-3, 1e-2, 1e-1, 1.0)}
+    grid = {"logisticregression__C": (1e-3, 1e-2, 1e-1, 1.0)}
     regression = LogisticRegression(max_iter=300, class_weight="balanced" if balanced else None)
     split = PredefinedSplit([-1] * len(train) + [0] * len(val))
-    score = "balanced_accuracy" if balanced else "accuracy"
-    probe = GridSearchCV(make_pipeline(StandardScaler(), regression), strengths, scoring=score, cv=split)
+    scoring = "balanced_accuracy" if balanced else "accuracy"
+    probe = GridSearchCV(make_pipeline(StandardScaler(), regression), grid, scoring=scoring, cv=split)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # an early end is a penalty, too
+        warnings.simplefilter("ignore", ConvergenceWarning)  # early stopping regularises, too
         probe.fit(torch.cat([train, val]).double().numpy(), torch.cat([labels, val_labels]).numpy())
     return torch.from_numpy(probe.predict(test.double().numpy()))
 
 
 def share_right(predicted: Tensor, labels: Tensor, *, balanced: bool = False) -> float:
-    """Share of classes (N,) that are the labels (N,), or its mean over the labels' classes, if balanced."""
+    """Accuracy of classes (N,) against labels (N,); with `balanced` the mean over the labels' classes."""
     score = balanced_accuracy_score if balanced else accuracy_score
     return float(score(labels.cpu().numpy(), predicted.cpu().numpy()))

@@ -1,7 +1,6 @@
 """Zero-shot classification: touches against the text of each class (Section 4.2 of the paper).
 
-Probabilities are a softmax over cosines at the temperature of training (Eq. 1), which is not calibrated: how sure they
-seem is not how often they are right.
+Probabilities are a softmax over cosines at the temperature of training (Eq. 1). They are not calibrated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +27,10 @@ def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: S
 
 
 class Named(dict[str, float]):
-    """Labels with their probabilities, best first; `str` says it in words.
+    """Labels with their probabilities, best first; `str` puts them in words.
 
     Attributes:
-        unknown: Why the model abstains, such as "unlike anything known"; `None` where it does not.
+        unknown: Why the model does not name the touch, such as "unlike anything known"; else `None`.
     """
 
     def __init__(self, labels: Mapping[str, float], unknown: str | None = None):
@@ -40,16 +39,18 @@ class Named(dict[str, float]):
 
     def __str__(self) -> str:
         if self.unknown is None:
-            return ", ".join(f"{name} {share:.0%}" for name, share in self.items())
-        return self.unknown if self.unknown == UNTOUCHED else f"{self.unknown} (nearest: {next(iter(self))})"
+            return ", ".join(f"{name} {probability:.0%}" for name, probability in self.items())
+        if self.unknown == UNTOUCHED:
+            return self.unknown
+        return f"{self.unknown} (nearest: {next(iter(self))})"
 
 
 class ZeroShotTouchClassifier:
-    """Names what touches are of, among labels in words, by a joint space alone; or says that it does not know them.
+    """Classifies touches among labels in words, by a joint space alone, or abstains if they are out of distribution.
 
     Args:
-        model: With touch and text.
-        processor: Of both.
+        model: With encoders of touch and text.
+        processor: Of both modalities.
 
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
@@ -79,9 +80,9 @@ class ZeroShotTouchClassifier:
         Args:
             touch: One or several touches, as pipelines take them.
             labels: Classes in words, two or more.
-            template: What they are put into, with one {}; the paper's if left out.
-            sensor: Which one took them, by name; the one whose prototype is nearest if left out.
-            top: How many labels of each; all if left out.
+            template: Prompt with one {} for the label; the paper's if left out.
+            sensor: Name of the sensor, or one for each touch; the one with the nearest prototype if left out.
+            top: Number of labels for each touch; all if left out.
 
         Raises:
             InvalidInputError, InvalidTypeError: If an argument cannot be used.
@@ -97,7 +98,10 @@ class ZeroShotTouchClassifier:
         texts = text_embeddings(self.model, self.processor, [template.format(name) for name in names])
         features, unknown = self.model.encode_touches(pixels, self.model.sensor_ids(matches))
         cosines = F.normalize(features.float(), dim=-1) @ texts.T
-        shares = (cosines / self.model.config.temperature).softmax(dim=1)
-        best = shares.topk(min(top or len(names), len(names)))
-        rows = zip(best.indices.tolist(), best.values.tolist(), unknown, strict=True)
-        return [Named({names[i]: p for i, p in zip(places, parts, strict=True)}, why) for places, parts, why in rows]
+        probabilities = (cosines / self.model.config.temperature).softmax(dim=1)
+        best = probabilities.topk(min(top or len(names), len(names)))
+        results = list[Named]()
+        for indices, values, reason in zip(best.indices.tolist(), best.values.tolist(), unknown, strict=True):
+            by_label = {names[index]: value for index, value in zip(indices, values, strict=True)}
+            results.append(Named(by_label, reason))
+        return results

@@ -1,1 +1,1 @@
-"""How good an answer is for the time it takes: exact problems, work-precision, stability."""
+"""Error against run time: problems with known flows, work-precision diagrams, stability."""

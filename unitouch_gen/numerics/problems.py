@@ -1,9 +1,9 @@
-"""Problems whose flow is known: Gaussian mixtures with their best denoisers, their flows, and a set of them by name.
+"""Problems whose flow is known: Gaussian mixtures with their optimal denoisers, their flows, and a set of them by name.
 
-Given x = x_0 + sigma n, the best prediction of data x_0 ~ sum_k N(m_k, diag v_k) / K is a mean of linear ones, each
-weighted by how probable its component is. All of it is computed in float64. Latents have four channels, as those of
-Stable Diffusion, but few pixels: what makes a problem hard is its spectrum, not its size, and solvers treat all axes
-alike, so that Gaussians along the pixels stand for those along any.
+Given x = x_0 + sigma n, the optimal prediction of data x_0 ~ sum_k N(m_k, diag v_k) / K is a mean of linear
+predictions, weighted by the probabilities of the components. All computations are in float64. Latents have four
+channels, as in Stable Diffusion, but few pixels: a problem is hard by its spectrum, not by its size. Solvers treat all
+axes alike, so Gaussians along the pixels represent those along any axes.
 """
 
 import math
@@ -36,32 +36,32 @@ class GaussianMixture:
     def posterior_means(self, x: Tensor, sigma: Tensor | float) -> tuple[Tensor, Tensor]:
         """E[x_0 | x] and E[n | x] = -sigma grad log p(x; sigma) (Tweedie's formula), (B, ...) float64.
 
-        The second is not computed from the first, from which a small sigma would leave few digits.
+        Computing the second from the first would lose digits at a small sigma.
         """
-        away = x.double().flatten(1).unsqueeze(1) - self.means  # (B, K, d)
+        offset = x.double().flatten(1).unsqueeze(1) - self.means  # (B, K, d)
         spread = self.variances + sigma**2  # (K, d)
-        fit = -0.5 * (away**2 / spread + spread.log()).sum(dim=2)
-        probable = fit.softmax(dim=1).unsqueeze(2)  # (B, K, 1)
-        denoised = (probable * (self.means + self.variances / spread * away)).sum(dim=1)
-        noise = (probable * sigma * away / spread).sum(dim=1)
+        log_likelihood = -0.5 * (offset**2 / spread + spread.log()).sum(dim=2)
+        weight = log_likelihood.softmax(dim=1).unsqueeze(2)  # (B, K, 1)
+        denoised = (weight * (self.means + self.variances / spread * offset)).sum(dim=1)
+        noise = (weight * sigma * offset / spread).sum(dim=1)
         return denoised.view(x.shape), noise.view(x.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Data, a noise schedule and guidance: what a solver is run on."""
+    """Data, a noise schedule and guidance, on which a solver is run."""
 
     name: str
-    data: GaussianMixture  # with guidance, what the condition stands for
-    unconditional: GaussianMixture | None = None
+    data: GaussianMixture  # with guidance, the data given the condition
+    unconditional: GaussianMixture | None = None  # with guidance, the data without condition
     guidance_scale: float = 1.0
     schedule_config: Mapping[str, Any] = field(default_factory=lambda: STABLE_DIFFUSION)
     prediction_type: str = "epsilon"
-    stiff: bool = False  # or otherwise extreme
+    stiff: bool = False  # stiff, or otherwise extreme
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """A sample's latents, (4, h, h)."""
+        """Shape of a sample's latents, (4, h, h)."""
         side = math.isqrt(self.data.means.shape[1] // 4)
         return 4, side, side
 
@@ -71,12 +71,13 @@ class Problem:
 
     @property
     def smallest_deviation(self) -> float:
-        """Along any axis of any component."""
-        return min(data.variances.min().sqrt().item() for data in (self.data, self.unconditional) if data is not None)
+        """The smallest deviation along any axis of any component."""
+        mixtures = [data for data in (self.data, self.unconditional) if data is not None]
+        return min(data.variances.min().sqrt().item() for data in mixtures)
 
     @property
     def is_gaussian(self) -> bool:
-        """Whether the flow is linear: Gaussian data, and with guidance both branches."""
+        """Whether the flow is linear, that is, the data is Gaussian, with guidance in both branches."""
         return len(self.data.means) == 1 and (self.unconditional is None or len(self.unconditional.means) == 1)
 
     @cached_property
@@ -84,32 +85,38 @@ class Problem:
         return NoiseSchedule.of(self.scheduler())
 
     def scheduler(self) -> DDIMScheduler:
-        """A scheduler in the place of a pipeline's own."""
+        """A scheduler of diffusers with this noise schedule."""
         return DDIMScheduler(**self.schedule_config, prediction_type=self.prediction_type, clip_sample=False)
 
     def noise(self, batch_size: int) -> Tensor:
-        """Unit-variance noise to start from, (B, 4, h, h) float64 that float32 holds exactly."""
+        """Unit-variance noise to start from, (B, 4, h, h) float64, exactly representable in float32."""
         generator = torch.Generator().manual_seed(0)
         return torch.stack([torch.randn(self.shape, generator=generator) for _ in range(batch_size)]).double()
 
     def denoise(self, x: Tensor, sigma: float) -> Tensor:
         """D(x, sigma), guided (Ho & Salimans, 2022), float64."""
-        conditional = self.data.posterior_means(x, sigma)[0]
+        conditional, _ = self.data.posterior_means(x, sigma)
         if self.unconditional is None or not self.guidance.active:
             return conditional
-        return self.guidance.combine(torch.cat([self.unconditional.posterior_means(x, sigma)[0], conditional]))
+        unconditional, _ = self.unconditional.posterior_means(x, sigma)
+        return self.guidance.combine(torch.cat([unconditional, conditional]))
 
     def network(self, batch_size: int) -> Network:
-        """The best possible network for B samples; of 2 B states the first half is unconditional."""
+        """The optimal network for B samples; of 2 B states the first half is unconditional."""
 
         def predict(z: Tensor, timestep: Tensor) -> Tensor:
             sigma = self.schedule.sigma(timestep)
             branches = [self.unconditional or self.data, self.data][-len(z) // batch_size :]
             states = (z.double() / alpha(sigma)).chunk(len(branches))
-            found = [data.posterior_means(x, sigma) for data, x in zip(branches, states, strict=True)]
-            denoised, noise = (torch.cat(parts) for parts in zip(*found, strict=True))
-            velocity = alpha(sigma) * (noise - sigma * denoised)  # alpha n - s x_0 (Salimans & Ho, 2022, Section 4)
-            return {"epsilon": noise, "v_prediction": velocity, "sample": denoised}[self.prediction_type].to(z.dtype)
+            posteriors = [data.posterior_means(x, sigma) for data, x in zip(branches, states, strict=True)]
+            denoised = torch.cat([data_mean for data_mean, _ in posteriors])
+            noise = torch.cat([noise_mean for _, noise_mean in posteriors])
+            predictions = {
+                "epsilon": noise,
+                "v_prediction": alpha(sigma) * (noise - sigma * denoised),  # (Salimans & Ho, 2022, Section 4)
+                "sample": denoised,
+            }
+            return predictions[self.prediction_type].to(z.dtype)
 
         return predict
 
@@ -130,40 +137,46 @@ class Problem:
             return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
 
     def path(self, noise: Tensor, sigmas: list[float]) -> list[Tensor]:
-        """Where the exact flow is at falling noise levels, (B, 4, h, h) float64 each.
+        """States of the exact flow at descending noise levels, (B, 4, h, h) float64 each.
 
-        Of one Gaussian, dx/dtau = (x - m) / (2 (v + tau)) with tau = sigma^2, and x - m goes as sqrt(v + tau).
+        For one Gaussian, dx/dtau = (x - m) / (2 (v + tau)) with tau = sigma^2, so x - m is proportional to sqrt(v +
+        tau).
         """
         first = self.schedule.sigma_max
         start = noise.double() * math.hypot(1.0, first)
         if not self.is_gaussian or self.guidance.active:
             lower = [sigma for sigma in sigmas if sigma < 0.999999 * first]
             return solve_flow(self.denoise, start, [first, *lower], rtol=1e-10)[-len(sigmas) :]
-        mean, variance = (values[0].view(self.shape) for values in (self.data.means, self.data.variances))
-        return [mean + ((variance + sigma**2) / (variance + first**2)).sqrt() * (start - mean) for sigma in sigmas]
+        mean = self.data.means[0].view(self.shape)
+        variance = self.data.variances[0].view(self.shape)
+        states = list[Tensor]()
+        for sigma in sigmas:
+            scale = ((variance + sigma**2) / (variance + first**2)).sqrt()
+            states.append(mean + scale * (start - mean))
+        return states
 
     def solution(self, noise: Tensor) -> Tensor:
-        """Where the exact flow ends; D is continued from its last levels to sigma = 0 as solvers do it."""
+        """The end of the exact flow; D is extrapolated from its last levels to sigma = 0, as solvers do it."""
         if self.is_gaussian and not self.guidance.active:
             return self.path(noise, [0.0])[0]
         last = min(1e-4 * self.smallest_deviation, self.schedule.sigma_min)
-        ends = [MIN_LEVEL_RATIO * last, last]
-        states = zip(ends, self.path(noise, ends), strict=True)
+        levels = [MIN_LEVEL_RATIO * last, last]
+        states = zip(levels, self.path(noise, levels), strict=True)
         return denoised_at_zero([(sigma, self.denoise(x, sigma)) for sigma, x in states])
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
-    """Root-mean-square distance of each sample (B, ...) to the truth, over the truth's own size, float64 (B,)."""
+    """Root-mean-square error of each sample (B, ...), relative to the truth's RMS, float64 (B,)."""
     truth = truth.double().flatten(1)
     return (value.double().flatten(1) - truth).norm(dim=1) / truth.norm(dim=1)
 
 
 def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float) -> list[Tensor]:
-    """x at each of falling noise levels, (B, C, h, w) float64, from x at the first of them.
+    """x at each of descending noise levels, (B, C, h, w) float64, from x at the first of them.
 
-    By scipy's DOP853, an explicit Runge-Kutta method of order 8, in u = log sigma, where the linear part of the flow
-    has rates between 0 and 1 however ill-conditioned the data is. The state is z = alpha x, whose root mean square
-    stays near 1 along the path,
+    It is solved by scipy's DOP853, an explicit Runge-Kutta method of order 8, in u = log sigma, where the linear part
+    of the flow has rates between 0 and 1, however ill-conditioned the data is. The state is z = alpha x, whose root
+    mean square stays near 1 along the path,
 
         dz/du = alpha^2 z - alpha D(z / alpha, sigma),
 
@@ -184,25 +197,33 @@ def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float
 
     levels = [math.log(sigma) for sigma in sigmas]
     start = (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
-    # Its norm is over the whole batch: divided by sqrt(B), no sample errs by more, even if all of the error is its own.
+    # scipy's norm is over the whole batch. Divided by sqrt(B), the tolerance bounds the error of every sample.
     tolerance = max(rtol / math.sqrt(len(x)), 1e-13)
-    found = solve_ivp(slope, (levels[0], levels[-1]), start, "DOP853", levels, rtol=tolerance, atol=tolerance)
-    if not found.success:
-        raise NotConvergedError(f"The reference stopped after {found.nfev} evaluations: {found.message}")
-    return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(found.y.T, sigmas, strict=True)]
+    result = solve_ivp(
+        slope,
+        t_span=(levels[0], levels[-1]),
+        y0=start,
+        method="DOP853",
+        t_eval=levels,
+        rtol=tolerance,
+        atol=tolerance,
+    )
+    if not result.success:
+        raise NotConvergedError(f"The reference stopped after {result.nfev} evaluations: {result.message}")
+    return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(result.y.T, sigmas, strict=True)]
 
 
 # The problems by name -------------------------------------------------------------------------------------------------
 
 
 def gaussian(smallest: float, dimensions: int = 16, mean: float = 0.1, largest: float = 1.0) -> GaussianMixture:
-    """A Gaussian whose variances fall to the smallest one, evenly in their logarithm."""
+    """A Gaussian whose variances fall from the largest to the smallest one, evenly in their logarithm."""
     variances = torch.linspace(math.log(largest), math.log(smallest), dimensions, dtype=torch.float64).exp()
     return GaussianMixture(torch.full((1, dimensions), mean, dtype=torch.float64), variances[None])
 
 
 def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMixture:
-    """Round Gaussians about means that are drawn from N(0, distance^2) in each of 16 dimensions."""
+    """Isotropic Gaussians around means drawn from N(0, distance^2) in each of 16 dimensions."""
     means = distance * torch.randn(4, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64)[:count]
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
@@ -210,8 +231,8 @@ def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMi
 WIDE = gaussian(0.1, mean=0.2)
 NARROW = gaussian(0.025, mean=0.275, largest=0.25)
 FEW_LEVELS = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
-COSINE = {"beta_schedule": "squaredcos_cap_v2"}  # from noise level 20 000
-ZERO_SNR = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}  # from noise level 4096
+COSINE = {"beta_schedule": "squaredcos_cap_v2"}  # starts at noise level 20 000
+ZERO_SNR = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}  # starts at noise level 4096
 
 PROBLEMS = {
     problem.name: problem
