@@ -36,7 +36,7 @@ from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.answers import caption_table
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
 from unitouch_gen.evaluation.controls import class_means, statistics, untrained_like, with_controls
-from unitouch_gen.evaluation.generated import beside_class_means, generate, some
+from unitouch_gen.evaluation.generated import beside_class_means, generate, sample_per_class
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
 from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
@@ -138,7 +138,7 @@ def touch_to_image_rows(
     pipe: Any, classifier: Any, contacts: Contacts, seed: int, each: int, **options: Any
 ) -> Figures:
     """Pictures of touches by sensors that nobody has seen."""
-    rows = some(contacts, each)
+    rows = sample_per_class(contacts, each)
     embeds = beside_class_means(pipe.encode_touch, "touch", contacts.touch, contacts, rows)
     made = {name: generate(pipe, seed, {"touch_embeds": values}, **options) for name, values in embeds.items()}
     found = image_rows(classifier, contacts, "image", rows, made, contacts.relit()[rows])
@@ -147,7 +147,7 @@ def touch_to_image_rows(
 
 def x_to_touch_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, each: int, **options: Any) -> Figures:
     """Touches by a named sensor, of pictures, captions, sounds and bare words: the materials' names."""
-    rows, figures = some(contacts, each), {}
+    rows, figures = sample_per_class(contacts, each), {}
     options["sensor"] = contacts.sensors[0]
     words = [MATERIAL_NAMES[number].replace("_", " ") for number in contacts.material.tolist()]
     inputs = {"photo": contacts.image, "caption": contacts.text, "sound": contacts.sounds(), "word": words}
@@ -167,7 +167,7 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     correlation of what is read off the picture with the touch's, and its ceiling that of the touch's own picture;
     "material of the touch" and "of the photo" are the shares that are named so.
     """
-    rows = some(contacts, each)
+    rows = sample_per_class(contacts, each)
     touched, names = rows.roll(each), [name for name in RELIEF if name in classifier.attributes]
     photos, touches = float_pixels(contacts.image)[rows], float_pixels(contacts.touch)[touched]
     truth = contacts.attributes.mean(dim=1)[touched][:, [ATTRIBUTES.index(name) for name in names]]
@@ -211,7 +211,7 @@ def photo_figures(pipes: Mapping[str, Any], contacts: Contacts, photos: Path, se
     "colours" that of all three channels, blurred by 6 of 128 pixels; "detail" the median energy of what has changed and
     is finer than that, over the energy of what is finer in the touch's own picture."""
     files = sorted(file for file in photos.iterdir() if file.suffix in (".jpg", ".png"))
-    touches = float_pixels(contacts.touch)[some(contacts, 1)[: len(files)]]
+    touches = float_pixels(contacts.touch)[sample_per_class(contacts, 1)[: len(files)]]
     shown = torch.stack([centre_rectangle(image, 128, 128) for image in load_images("photos", files)])[: len(touches)]
     made = generate(pipes["stylization"], seed, {"image": shown, "touch": touches})
     own = generate(pipes["touch-to-image"], seed, {"touch": touches})
