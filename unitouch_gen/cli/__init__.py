@@ -1,4 +1,4 @@
-"""`unitouch-gen ...`: a thin layer over the pipelines. Each command imports what it needs when it runs."""
+"""`unitouch-gen`: commands, a thin layer over the pipelines. Each command imports its dependencies when it runs."""
 
 import signal
 import sys
@@ -24,9 +24,9 @@ from unitouch_gen.errors import run_commands
 commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-def print_version(asked: bool) -> None:
-    """What --version does."""
-    if asked:
+def print_version(requested: bool) -> None:
+    """Prints the version and exits, for --version."""
+    if requested:
         typer.echo(f"unitouch_gen {__version__}")
         raise typer.Exit
 
@@ -48,15 +48,15 @@ commands.add_typer(data, name="data")
 
 
 def main() -> None:
-    """Entry point: turns users' mistakes into one line and exit code 2."""
-    with suppress(ValueError):  # signals are the main thread's
+    """Entry point. A user's mistake ends in one line and exit code 2."""
+    with suppress(ValueError):  # raised outside of the main thread
         interrupt_on_termination()
     sys.exit(run_commands(commands, "unitouch-gen"))
 
 
 def interrupt_on_termination() -> None:
-    """Has signals that end a process interrupt it as Ctrl-C does, so that temporary folders are removed."""
-    for name in ("SIGTERM", "SIGHUP"):  # of `docker stop`, systemd and Slurm; of a terminal that closes
+    """Makes SIGTERM and SIGHUP interrupt the process as Ctrl-C does, so that temporary folders are removed."""
+    for name in ("SIGTERM", "SIGHUP"):  # sent by `docker stop`, systemd and Slurm, and by a terminal that closes
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
             signal.signal(number, signal.default_int_handler)

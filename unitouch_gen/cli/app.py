@@ -1,4 +1,4 @@
-"""`unitouch-gen app`: a page in the browser, for this machine alone by default."""
+"""`unitouch-gen app`: a web page, by default for this machine only."""
 
 import os
 import socket
@@ -15,7 +15,9 @@ from unitouch_gen.errors import InvalidInputError, needed
 
 
 def app(
-    host: Annotated[str, typer.Option(help="To serve at; 0.0.0.0 lets in everyone who reaches it.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to serve at; 0.0.0.0 serves every machine that can reach it.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve at.")] = 7860,
     model: Annotated[list[str] | None, typer.Option(help=f"{options.A_FOLDER} a pipeline; repeatable.")] = None,
     dtype: options.Dtype = None,
@@ -27,18 +29,18 @@ def app(
 
     Example: unitouch-gen app --port 7860
     """
-    host = host.strip("[]")  # of an IPv6 address as it stands in a URL
+    host = host.strip("[]")  # as around an IPv6 address in a URL
     check_address(host, port)
     os.environ["HF_HUB_DISABLE_TELEMETRY"] = "1"
-    from unitouch_gen.pipelines.tiny import PIPELINES  # after that, as huggingface_hub reads it at import
+    from unitouch_gen.pipelines.tiny import PIPELINES  # huggingface_hub reads the variable at import
 
     folders: dict[str, str | None] = dict.fromkeys(PIPELINES)
     if model:
-        kinds = [kind_of(one, PIPELINES) for one in model]
+        kinds = [kind_of(name, PIPELINES) for name in model]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InvalidInputError(f"`--model` names {kinds.count(kind)} pipelines for {kind}; name one of each.")
-        folders = {kind: str(folder_of(one)) for kind, one in zip(kinds, model, strict=True)}
+        folders = {kind: str(folder_of(name)) for kind, name in zip(kinds, model, strict=True)}
     with tempfile.TemporaryDirectory(prefix="unitouch-") as uploads:
         isolate_gradio(uploads)
         needed("gradio", "app")
@@ -54,8 +56,8 @@ def app(
 
 
 def check_address(host: str, port: int) -> None:
-    """Raises if the port is taken or the host is none of this machine's, before anything is loaded."""
-    for name in (host, "127.0.0.1"):  # where gradio asks for the port as well
+    """Raises if the port is taken or the host is none of this machine's addresses, before anything is loaded."""
+    for name in (host, "127.0.0.1"):  # gradio opens the port at the latter, too
         family = socket.AF_INET6 if ":" in name else socket.AF_INET
         try:
             socket.create_server((name, port), family=family).close()
@@ -64,11 +66,12 @@ def check_address(host: str, port: int) -> None:
 
 
 def isolate_gradio(uploads: str) -> None:
-    """Sets the environment that gradio reads: a folder for uploads, no statistics, no proxy and no other settings.
+    """Sets gradio's environment: a folder for uploads, no statistics, no proxy and no other settings.
 
-    GRADIO_SHARE, GRADIO_ALLOWED_PATHS and the like would let in others or show them files. A proxy would be asked for
-    the page itself.
+    GRADIO_SHARE, GRADIO_ALLOWED_PATHS and the like would admit others or show them files. Requests for the page itself
+    would go to a proxy.
     """
-    for name in [name for name in os.environ if name.startswith("GRADIO_") and name != "GRADIO_ROOT_PATH"]:
+    settings = [name for name in os.environ if name.startswith("GRADIO_") and name != "GRADIO_ROOT_PATH"]
+    for name in settings:
         del os.environ[name]
     os.environ.update(GRADIO_ANALYTICS_ENABLED="False", GRADIO_TEMP_DIR=uploads, no_proxy="*")

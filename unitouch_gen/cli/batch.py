@@ -1,4 +1,4 @@
-"""`unitouch-gen batch`: a picture of every line of a table, or every file of a folder, over accelerate's processes."""
+"""`unitouch-gen batch`: pictures of the lines of a table or the files of a folder, over accelerate's processes."""
 
 import inspect
 import json
@@ -18,13 +18,13 @@ from unitouch_gen.files import files_below, find_file, read_table, write_file
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
-"""Arguments of a call in which its pictures may differ."""
+"""Arguments of a call that may be different for each of its pictures."""
 
 
 def batch(
     context: Context,
-    source: Annotated[Path, Argument(help="A .csv with a line for each picture, or a folder.")],
-    output: Annotated[Path, Option("--output", "-o", help="A folder; pictures that are there stay.")],
+    source: Annotated[Path, Argument(help="A .csv with a line for each picture, or a folder of inputs.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the pictures; those that are there are kept.")],
     pipeline: Annotated[str, Option(help=f"{', '.join(DRAWING)}.")] = "touch-to-image",
     sensor: options.Sensor = None,
     num_inference_steps: options.Steps = None,
@@ -54,50 +54,62 @@ def batch(
 
     from unitouch_gen.pipelines.tiny import PIPELINES
 
-    kind = PIPELINES[pipeline]
-    shared = options.call_arguments(context, kind)
-    known = inspect.signature(kind.__call__).parameters
-    columns = ["name", "seed", *(column for column in COLUMNS if column in known)]
-    folder = source if source.is_dir() else source.parent
-    rows = [{"seed": str(seed), **{column: cell for column, cell in row.items() if cell}} for row in rows]
-    pictures = pictures_of(rows, columns, folder, output)
+    shared = options.call_arguments(context, PIPELINES[pipeline])
+    pictures = pictures_of(rows, PIPELINES[pipeline], source, output, seed)
     manifest = output / "manifest.jsonl"
     options.check_output([manifest], overwrite=True)
     end_last_line(manifest)
 
     state = PartialState(cpu=not torch.cuda.is_available())
-    failed = list[str]()
-    most = 1 if "tolerance" in shared else batch_size  # the samples of a call choose its steps together
-    alike: dict[tuple[str, ...], list[Picture]] = {}  # of the same kinds of inputs
-    for one in (picture for picture in pictures if not picture.file.exists()):
-        alike.setdefault(tuple(one.inputs), []).append(one)
-    calls = [group[start : start + most] for group in alike.values() for start in range(0, len(group), most)]
-    state.wait_for_everyone()  # or the last process would not miss what the first has made
+    # The samples of a call choose its adaptive steps together.
+    calls = calls_of(pictures, 1 if "tolerance" in shared else batch_size)
+    state.wait_for_everyone()  # so that the first process does not write pictures before the last has looked for them
     if device == "auto" and state.num_processes > 1:
         context.params["device"] = str(state.device)
     loading = options.model_options(context)
     pipe = load_pipeline(pipeline, quiet=options.is_quiet(False), **loading) if calls else None
     output.mkdir(parents=True, exist_ok=True)
-    with state.split_between_processes(calls) as mine:
-        for call in tqdm(mine, unit="call", disable=None if state.is_main_process else True):
-            made = make(pipe, call, shared)
+    failed = list[str]()
+    with state.split_between_processes(calls) as own_calls:
+        for call in tqdm(own_calls, unit="call", disable=None if state.is_main_process else True):
+            results = make(pipe, call, shared)
             with manifest.open("a", encoding="utf-8") as stream:
-                stream.write("".join(f"{json.dumps(line)}\n" for _, line in made))
-            for (image, line), picture in zip(made, call, strict=True):
-                if image is None:
-                    failed.append(f"{picture.file} failed: {line['error']}")
-                else:
-                    save(image, picture.file)
+                stream.write("".join(f"{json.dumps(line)}\n" for _, line in results))
+            failed += save_images(results, call)
     failed = gather_object(failed)
-    state.destroy_process_group()  # or now and then a process aborts as it ends
+    state.destroy_process_group()  # without this, the process sometimes aborts at its end
     if state.is_main_process:
         options.note(*failed)
         echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
     raise Exit(1 if failed else 0)
 
 
+def calls_of(pictures: Sequence[Picture], size: int) -> list[list[Picture]]:
+    """The pictures that are not there yet, in calls of at most `size` with the same kinds of inputs."""
+    groups: dict[tuple[str, ...], list[Picture]] = {}
+    for picture in pictures:
+        if not picture.file.exists():
+            groups.setdefault(tuple(picture.inputs), []).append(picture)
+    calls = list[list[Picture]]()
+    for group in groups.values():
+        for start in range(0, len(group), size):
+            calls.append(group[start : start + size])
+    return calls
+
+
+def save_images(results: Sequence[tuple[Any, dict[str, Any]]], call: Sequence[Picture]) -> list[str]:
+    """Saves the images of a call, and returns a line for each picture that failed."""
+    failed = list[str]()
+    for (image, line), picture in zip(results, call, strict=True):
+        if image is None:
+            failed.append(f"{picture.file} failed: {line['error']}")
+        else:
+            save(image, picture.file)
+    return failed
+
+
 def end_last_line(manifest: Path) -> None:
-    """Ends the last line of a manifest that a full disk cut; one that is not a whole line of JSON is left out."""
+    """Completes the last line of a manifest that was cut off by a full disk, or removes it if it is no whole JSON."""
     content = manifest.read_bytes() if manifest.exists() else b""
     if not content or content.endswith(b"\n"):
         return
@@ -111,41 +123,61 @@ def end_last_line(manifest: Path) -> None:
 
 
 def in_folder(folder: Path, pipeline: str, output: Path) -> list[dict[str, str]]:
-    """The columns of every file of a folder and those below, but for the output; places are the pictures' names."""
+    """A row for every input below a folder, without those in the output; pictures are named after their paths."""
     modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
     columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     if os.path.realpath(output) == os.path.realpath(folder):
         raise InvalidInputError(f"`--output` is {str(output)!r}, the folder of the inputs; name another one.")
     paths = [file for file in files_below(folder) if output.resolve() not in file.resolve().parents]
-    files = files_in("source", str(folder), folder, paths, columns)
-    places = [(columns[file.suffix.lower()], file.relative_to(folder)) for file in files]
-    return [{column: str(place), "name": str(place.with_suffix(""))} for column, place in places]
+    rows = list[dict[str, str]]()
+    for file in files_in("source", str(folder), folder, paths, columns):
+        path = file.relative_to(folder)
+        rows.append({columns[file.suffix.lower()]: str(path), "name": str(path.with_suffix(""))})
+    return rows
 
 
-def pictures_of(rows: Sequence[dict[str, str]], columns: Sequence[str], folder: Path, output: Path) -> list[Picture]:
-    """What is made of each row, and where it goes: by its name, or that of what it is made of.
+def pictures_of(rows: Sequence[dict[str, str]], kind: Any, source: Path, output: Path, seed: int) -> list[Picture]:
+    """The picture of each row: its inputs, its file and its seed.
 
-    Names of files in the rows start from a folder.
+    Files in rows are relative to the folder of the table. A picture is named by its row, or after its first input.
+
+    Args:
+        rows: Cells by column.
+        kind: Class of the pipeline, whose arguments are the columns.
+        source: A folder, or a table in it.
+        output: Folder of the pictures.
+        seed: For rows without one.
     """
+    parameters = inspect.signature(kind.__call__).parameters
+    columns = ["name", "seed", *(column for column in COLUMNS if column in parameters)]
+    folder = (source if source.is_dir() else source.parent).absolute()
+    rows = [{column: cell for column, cell in row.items() if cell} for row in rows]
     names = list[str]()
-    pictures = list[Picture]()
     for row in rows:
         for column in row:
             check_choice("column", column, columns)
-        stems = (stem_of(Path(row[name])) for name in FILES if name in row)
-        names.append(row.get("name") or next(stems, stem_of(row.get("text", ""))))
-        if Path(names[-1]).is_absolute() or ".." in Path(names[-1]).parts:
-            raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
+        names.append(name_of(row))
+    pictures = list[Picture]()
     for name, row in zip(unique(names), rows, strict=True):
-        own = {column: row[column] for column in COLUMNS if column in row}
-        place = folder.absolute()
-        inputs = {column: str(find_file(place, cell)) if column in FILES else cell for column, cell in own.items()}
-        pictures.append(Picture(inputs, output / f"{name}.png", seed_of(row["seed"])))
+        inputs = {column: row[column] for column in COLUMNS if column in row}
+        for column in FILES:
+            if column in inputs:
+                inputs[column] = str(find_file(folder, inputs[column]))
+        pictures.append(Picture(inputs, output / f"{name}.png", seed_of(row.get("seed", str(seed)))))
     return pictures
 
 
+def name_of(row: dict[str, str]) -> str:
+    """The name of a row's picture, or the stem of its first file, or the first words of its text."""
+    stems = [stem_of(Path(row[column])) for column in FILES if column in row]
+    name = row.get("name") or (stems[0] if stems else stem_of(row.get("text", "")))
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InvalidInputError(f"`name` is {name!r}, a place elsewhere; name one in the output.")
+    return name
+
+
 def seed_of(cell: str) -> int:
-    """The seed in a cell, also written as 1.0: pandas makes floats of a column of integers and blanks."""
+    """The seed in a cell; 1.0 is 1, since pandas makes floats of a column of integers and blanks."""
     value = options.value_of(cell)
     if isinstance(value, float) and value.is_integer():
         value = int(value)
@@ -153,12 +185,21 @@ def seed_of(cell: str) -> int:
 
 
 def make(pipe: Any, call: list[Picture], settings: dict[str, Any]) -> list[tuple[Any, dict[str, Any]]]:
-    """A call's PIL images, `None` for those that fail, and lines of the manifest; if it fails, each is tried alone."""
+    """PIL images of a call and lines of the manifest; if the call fails, each picture is tried alone.
+
+    The image of a picture that fails is `None`, and its line has the error.
+    """
     try:
         output = draw(pipe, call, settings)
     except (InvalidInputError, errors.InvalidTypeError, errors.NonFiniteError, errors.NotConvergedError) as error:
         if len(call) > 1:
-            return [made for one in call for made in make(pipe, [one], settings)]
-        return [(None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
-    lines = [{**settings, **described(one, output.report, row), "seed": one.seed} for row, one in enumerate(call)]
+            results = list[tuple[Any, dict[str, Any]]]()
+            for picture in call:
+                results += make(pipe, [picture], settings)
+            return results
+        picture = call[0]
+        return [(None, {"picture": str(picture.file), **picture.inputs, "error": first_line(error)})]
+    lines = list[dict[str, Any]]()
+    for row, picture in enumerate(call):
+        lines.append({**settings, **described(picture, output.report, row), "seed": picture.seed})
     return list(zip(output.images, lines, strict=True))

@@ -1,4 +1,4 @@
-"""Models made of others: `unitouch-gen convert unitouch` and `touch-llm` of checkpoints, `distill` of a pipeline."""
+"""`unitouch-gen convert unitouch`, `convert touch-llm` and `distill`: models from checkpoints and pipelines."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ app = Typer(no_args_is_help=True, help="Published checkpoints as folders of safe
 
 @app.command()
 def unitouch(
-    output: Annotated[Path, Option("--output", "-o", help="A folder that holds no model yet.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the model, without one yet.")],
     touch: Annotated[Path | None, Option(**FILE, help="UniTouch's last_new.ckpt, for touch.")] = None,
     imagebind: Annotated[Path | None, Option(**FILE, help="ImageBind's imagebind_huge.pth, for the others.")] = None,
     tokenizer: Annotated[Path | None, Option(exists=True, help="Folder `tokenizer` of SD 2.1 unCLIP.")] = None,
@@ -29,11 +29,16 @@ def unitouch(
     from unitouch_gen.convert import convert_published
     from unitouch_gen.models import UniTouchConfig
 
-    sizes = None if config is None else UniTouchConfig.from_dict(read_settings("--config", config))
-    kind = None if dtype is None else check_dtype("--dtype", dtype)
-    lacks = convert_published(output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind)
-    if lacks:
-        echo(f"The files lack {', '.join(lacks)}")
+    missing = convert_published(
+        output,
+        touch=touch,
+        imagebind=imagebind,
+        tokenizer=tokenizer,
+        config=None if config is None else UniTouchConfig.from_dict(read_settings("--config", config)),
+        dtype=None if dtype is None else check_dtype("--dtype", dtype),
+    )
+    if missing:
+        echo(f"The files lack {', '.join(missing)}")
     echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     echo(f"The model is in {output.resolve()}")
 
@@ -42,11 +47,11 @@ def unitouch(
 def touch_llm(
     bridge: Annotated[Path, Option(**FILE, help="Touch-LLM's checkpoint.")],
     llama: Annotated[str, Option(help="Folder or repository id of the LLaMA it was trained on.")],
-    output: Annotated[Path, Option("--output", "-o", help="A folder for the pipeline.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the pipeline.")],
     unitouch: Annotated[str | None, Option(help="Folder that `convert unitouch` wrote.")] = None,
     dtype: Annotated[str, Option(help="float32, float16 or bfloat16.")] = "float16",
 ) -> None:
-    """Converts Touch-LLM's checkpoint: its bridge, and the LLaMA with what was fine-tuned of it.
+    """Converts Touch-LLM's checkpoint: its bridge, and the LLaMA with its fine-tuned weights.
 
     Example: unitouch-gen convert touch-llm --bridge checkpoint.pth --llama llama-7b --unitouch unitouch -o touch-llm
     """
@@ -54,11 +59,11 @@ def touch_llm(
     from unitouch_gen.pipelines import TouchToTextPipeline
     from unitouch_gen.pipelines.published import read_joint
 
-    kind = check_dtype("--dtype", dtype)
-    parts = read_touch_llm(bridge, llama, dtype=kind)
+    weights_dtype = check_dtype("--dtype", dtype)
+    components = read_touch_llm(bridge, llama, dtype=weights_dtype)
     if unitouch is not None:
-        parts["unitouch"], parts["processor"] = read_joint(unitouch, kind)
-    TouchToTextPipeline(**parts).save_pretrained(output)
+        components["unitouch"], components["processor"] = read_joint(unitouch, weights_dtype)
+    TouchToTextPipeline(**components).save_pretrained(output)
     echo("Licence: CC-BY-NC-4.0, as UniTouch's, and LLaMA's own; not for commercial use")
     echo(f"The pipeline is in {output.resolve()}")
 
@@ -67,18 +72,28 @@ def distill(
     model: Annotated[str, Option(help="Folder or repository id of a saved pipeline.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder for the LoRA weights and checkpoints.")],
     recipe: Annotated[str | None, Option(help="A YAML file, or the name of a recipe of the package.")] = None,
-    overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Of the recipe.")] = None,
+    overrides: Annotated[
+        list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="A value of the recipe to replace.")
+    ] = None,
     cache: Annotated[Path, Option(help="Folder for rendered or decoded training data.")] = Path("runs/cache"),
     resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
     init: Annotated[Path | None, Option(exists=True, help="Folder of LoRA weights to start from.")] = None,
 ) -> None:
-    """Learns LoRA weights by which a pipeline draws in four evaluations without guidance (DMD2, LoRA).
+    """Trains LoRA weights with which a pipeline draws in four evaluations without guidance (DMD2).
 
     Example: unitouch-gen distill --model my-pipeline -o runs/turbo
     """
     folder = folder_of(model)
     from unitouch_gen.training.stages import run_stage
 
-    given = {"recipe": recipe, "overrides": overrides, "cache": cache, "resume": resume, "init": init}
-    run_stage("distill", model=folder, output=output, **given)
+    run_stage(
+        "distill",
+        model=folder,
+        output=output,
+        recipe=recipe,
+        overrides=overrides,
+        cache=cache,
+        resume=resume,
+        init=init,
+    )
     echo(f"The weights are in {(output / 'model').resolve()}; pipe.load_lora_weights(...) reads them, for LCMScheduler")

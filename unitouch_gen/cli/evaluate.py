@@ -1,4 +1,4 @@
-"""`unitouch-gen evaluate`: tables of the paper, on the world or on data sets, each figure beside its controls."""
+"""`unitouch-gen evaluate`: tables of the paper, on the world or on data sets, with controls."""
 
 import json
 import time
@@ -27,10 +27,10 @@ TABLES = {
 }
 GENERATED = ("touch-to-image", "x-to-touch")
 PIPELINES = {**{name: name for name in GENERATED}, "caption": "touch-to-text"}
-"""Tables of what pipelines make, and which ones."""
+"""Tables of outputs of pipelines, and the pipelines."""
 
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
-"""Sensors of the world that a model may have been trained on: those of the paper's training sets."""
+"""Sensors of the paper's training sets, which a model may have been trained on."""
 
 Rows = dict[str, dict[str, list[float]]]
 """Figures by row and column, one for each world."""
@@ -41,13 +41,13 @@ def evaluate(
     output: Annotated[Path | None, Option("--output", "-o", help="Folder for TABLE.json.")] = None,
     model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
     data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
-    kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
+    kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; auto recognises it.")] = "auto",
     sensor: Annotated[str | None, Option(help="Sensor of all touches of the data sets.")] = None,
     materials: options.Materials = None,
-    seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
-    objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
-    each: Annotated[int, Option(min=2, max=10_000, help="Contacts of each material that images are made of.")] = 4,
-    cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
+    seeds: Annotated[int, Option(min=1, max=10_000, help="Number of worlds to average over.")] = 3,
+    objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material in a world.")] = 8,
+    each: Annotated[int, Option(min=2, max=10_000, help="Contacts of each material to generate images for.")] = 4,
+    cache: Annotated[Path | None, Option(help="Folder for rendered and decoded data.")] = None,
     device: options.Device = "auto",
     overwrite: options.Overwrite = False,
 ) -> None:
@@ -63,60 +63,89 @@ def evaluate(
 
     if output is not None:
         options.check_output([output / f"{table}.json"], overwrite)
-    given: Any = {"sensor": sensor, "materials": options.by_comma(materials)}
-    folders = [open_dataset(folder, kind, **given) for folder in data or ()]
+    material_names = options.by_comma(materials)
+    data_sets = [open_dataset(folder, kind, sensor=sensor, materials=material_names) for folder in data or ()]
     pipe = load_pipeline(PIPELINES[table], model=model, device=device) if table in PIPELINES else None
     joint, processor = load_joint_space(model, device)
-    check_table(table, joint, pipe, folders, each)
+    check_table(table, joint, pipe, data_sets, each)
     with TemporaryDirectory(prefix="unitouch-") as scratch:
-        place = cache or Path(scratch)
+        cache_folder = cache or Path(scratch)
         started = time.perf_counter()
-        if folders:
-            sets = of_datasets(place, joint, processor, folders)
+        if data_sets:
+            sets = of_datasets(cache_folder, joint, processor, data_sets)
         else:
-            known = [name for name in NAMED if name in joint.config.sensors]
-            sets = of_world(place, joint, processor, known, range(seeds), objects, grasps=table == "grasp")
-        rows = figures_of(table, sets, joint, processor, pipe, each)
+            sensors = [name for name in NAMED if name in joint.config.sensors]
+            grasps = table == "grasp"
+            sets = of_world(cache_folder, joint, processor, sensors, range(seeds), objects, grasps=grasps)
+        rows = figures_of(table, sets, joint=joint, processor=processor, pipe=pipe, each=each)
     if output is not None:
-        facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
-        content = json.dumps({"table": table, "rows": rows, **facts}, indent=2)
-        write_file("--output", output / f"{table}.json", content + "\n")
+        content = {
+            "table": table,
+            "rows": rows,
+            "version": __version__,
+            "model": model or "built-in",
+            "seconds": round(time.perf_counter() - started),
+        }
+        write_file("--output", output / f"{table}.json", json.dumps(content, indent=2) + "\n")
     show(table, rows)
     if output is not None:
         echo(f"The table is in {output.resolve()}")
 
 
-def check_table(name: str, joint: Any, pipe: Any, folders: Sequence[Any], each: int) -> None:
-    """Refuses models and data sets that lack what a table needs, before their files are read."""
-    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
-    from unitouch_gen.training.data.heldout import modalities_of, parts_of
+LABELS = {"material": "material", "prompts": "material", "grasp": "grasp"}
+"""Labels that tables need."""
 
-    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
-    needed = {"touch-to-image": {"image"}, "caption": {"text"}}
-    asked = {"text"} if label else needed.get(name, {"image", "audio", "text"})
-    usable = asked & {*joint.known_modalities}
+
+def check_table(name: str, joint: Any, pipe: Any, data_sets: Sequence[Any], each: int) -> None:
+    """Raises for models and data sets that lack what a table needs, before their files are read."""
+    modalities = {"touch-to-image": {"image"}, "caption": {"text"}}
+    needed = {"text"} if name in LABELS else modalities.get(name, {"image", "audio", "text"})
+    usable = needed & {*joint.known_modalities}
     if "touch" not in joint.known_modalities or not usable:
-        wanted = " or ".join(sorted(asked))
+        wanted = " or ".join(sorted(needed))
         raise InvalidInputError(f"`--model` has no encoders of touch and {wanted}, which {name!r} needs.")
     if name == "x-to-touch":
-        known = {*(pipe.config.sensors or ())}
-        felt = {record.sensor for data in folders for record in data.records} if folders else known & {*NAMED}
-        if not felt or felt - known:
-            words = ", ".join(sorted(known))
-            raise InvalidInputError(f"The touches are by sensors other than {words}, which `--model` draws for.")
-    for data in folders:
-        parts = parts_of(data)
-        for split, part in parts.items() if label else ():
-            found = {data.classes[label][r.labels[label]] for r in part.records if label in r.labels}
-            if len(found) < 2 or (label == "grasp" and not found <= {*GRASP_PROMPTS}):
-                wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
-                has = f"{', '.join(sorted(found)) or 'none'} of {label} to {split} on"
-                raise InvalidInputError(f"{data} has the classes {has}, not {wanted}.")
-        if not label and not usable & {*modalities_of(data)}:
-            raise InvalidInputError(f"{data} has no {' or '.join(sorted(usable))} of every touch.")
-        least = each * len({record.labels.get("material") for record in parts["test"].records}) + 2
-        if name in GENERATED and len(parts["test"]) < least:
-            raise InvalidInputError(f"{data} has {len(parts['test'])} contacts to test on; {name!r} needs {least}.")
+        check_sensors(pipe, data_sets)
+    for data in data_sets:
+        check_data_set(name, data, usable, each)
+
+
+def check_sensors(pipe: Any, data_sets: Sequence[Any]) -> None:
+    """Raises if there are touches by sensors that a pipeline does not draw for."""
+    known = {*(pipe.config.sensors or ())}
+    sensors = known & {*NAMED}
+    if data_sets:
+        sensors = {record.sensor for data in data_sets for record in data.records}
+    if not sensors or sensors - known:
+        words = ", ".join(sorted(known))
+        raise InvalidInputError(f"The touches are by sensors other than {words}, which `--model` draws for.")
+
+
+def check_data_set(name: str, data: Any, usable: set[str], each: int) -> None:
+    """Raises if a data set lacks classes, modalities or contacts that a table needs."""
+    from unitouch_gen.training.data.heldout import modalities_of, parts_of
+
+    parts = parts_of(data)
+    if name in LABELS:
+        for split, part in parts.items():
+            check_classes(data, split, part, LABELS[name])
+    elif not usable & {*modalities_of(data)}:
+        raise InvalidInputError(f"{data} has no {' or '.join(sorted(usable))} of every touch.")
+    test = parts["test"]
+    least = each * len({record.labels.get("material") for record in test.records}) + 2
+    if name in GENERATED and len(test) < least:
+        raise InvalidInputError(f"{data} has {len(test)} contacts to test on; {name!r} needs {least}.")
+
+
+def check_classes(data: Any, split: str, part: Any, label: str) -> None:
+    """Raises if a split of a data set has fewer than two classes of a label, or unknown ones of grasps."""
+    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
+
+    classes = {data.classes[label][record.labels[label]] for record in part.records if label in record.labels}
+    if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
+        wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
+        has = f"{', '.join(sorted(classes)) or 'none'} of {label} to {split} on"
+        raise InvalidInputError(f"{data} has the classes {has}, not {wanted}.")
 
 
 def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, each: int) -> Rows:
@@ -133,40 +162,46 @@ def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, eac
         return text_embeddings(joint, processor, texts).cpu()
 
     folders = {"image": weights.PICTURE_CLASSIFIER, "touch": weights.TOUCH_CLASSIFIER}
-    judges = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
-    asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
-    drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
+    classifiers = {
+        name: ContactClassifier.from_pretrained(folder, dtype=torch.float32) for name, folder in folders.items()
+    }
+    by_label = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
+    by_images = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     rows: Rows = {}
-    drawn = set[tuple[str, int]]()
+    generated_for = set[tuple[str, int]]()
     for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
-        if table in asking:
-            found = {row: {f"{sensor}, {domain}": share} for row, share in asking[table](splits, embed).items()}
+        if table in by_label:
+            accuracies = by_label[table](splits, embed)
+            figures = {row: {f"{sensor}, {domain}": accuracy} for row, accuracy in accuracies.items()}
         elif table == "retrieval":
-            found = tables.retrieval_table(splits)
+            figures = tables.retrieval_table(splits)
         elif table == "caption":
-            found = caption_table(pipe, splits, embed, each)
+            figures = caption_table(pipe, splits, embed, each)
         else:
-            felt = {*splits["test"].sensors}
-            if (domain, seed) in drawn or (table == "x-to-touch" and not felt <= {*pipe.config.sensors}):
+            # Images take time, so they are generated for one sensor of each domain and world.
+            is_drawable = table != "x-to-touch" or {*splits["test"].sensors} <= {*pipe.config.sensors}
+            if (domain, seed) in generated_for or not is_drawable:
                 continue
-            drawn.add((domain, seed))  # images take time, so they are of one sensor of each domain
-            found = drawing[table](pipe, splits, judges, each, seed)
-        for row, values in found.items():
-            columns = rows.setdefault(row if table in asking else f"{row}, {domain}", {})
+            generated_for.add((domain, seed))
+            figures = by_images[table](pipe, splits, classifiers, each, seed)
+        for row, values in figures.items():
+            columns = rows.setdefault(row if table in by_label else f"{row}, {domain}", {})
             for column, value in values.items():
                 columns.setdefault(column, []).append(value)
     return rows
 
 
 def show(table: str, rows: Rows) -> None:
-    """Prints a table: means over worlds, in brackets their spread."""
+    """Prints a table of means over worlds, with their spread in brackets."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
     scale, digits = (1, 2) if table in GENERATED else (100, 1)
 
     def cell(values: Sequence[float]) -> str:
+        if not values:
+            return ""
         spread = f" ({scale * (max(values) - min(values)):.{digits}f})" if len(values) > 1 else ""
-        return f"{scale * mean(values):.{digits}f}{spread}" if values else ""
+        return f"{scale * mean(values):.{digits}f}{spread}"
 
     echo(TABLES[table])
     lines = [[row, *(cell(values.get(column, ())) for column in columns)] for row, values in rows.items()]

@@ -1,4 +1,4 @@
-"""Files and models that commands run on."""
+"""Loading of the files and models of commands."""
 
 import glob
 import logging
@@ -27,56 +27,57 @@ from unitouch_gen.weights import JOINT
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".bmp", ".gif", ".tif", ".tiff", ".webp", ".avif", ".npy"})
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
-WANTED = {"audio": "a sound file", "height": "a height map"}  # by modality, for messages; else an image file
+WANTED = {"audio": "a sound file", "height": "a height map"}  # for messages, by modality; else an image file
 
 DRAWING = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
-"""The built-in pipelines that make images, and what they are given of a contact to be measured on."""
+"""The built-in pipelines that generate images, and their inputs when they are measured."""
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
 def suffixes_of(modality: str) -> frozenset[str]:
-    """Suffixes of the files in a folder that are taken for "touch", "image", "height" or "audio"."""
+    """Suffixes of files of a modality: "touch", "image", "height" or "audio"."""
     from unitouch_gen.models.videos import VIDEOS
 
     return {"audio": SOUNDS, "image": IMAGES, "height": IMAGES, "touch": IMAGES.union(VIDEOS)}[modality]
 
 
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
-    """The files of a modality that words of a command line stand for, in their order.
+    """The files of a modality that words of a command line name, in their order.
 
-    A word is the path of a file, of a folder, a pattern such as "touches/**/*.png", or "example:brick". Of folders and
-    patterns, what is hidden or has another suffix is left out. `name` is the argument, for the messages.
+    A word is the path of a file or of a folder, a pattern such as "touches/**/*.png", or "example:brick". Hidden files,
+    and files with other suffixes, are left out of folders and patterns. `name` is the argument, for the messages.
     """
-    found: list[Path] = []
+    all_files = list[Path]()
     for word in words:
         if word.startswith("example:"):
             files = [example(word.removeprefix("example:"), modality)]
         elif os.path.isdir(word):
             files = files_in(name, word, Path(word), Path(word).iterdir(), suffixes_of(modality))
         elif not os.path.lexists(word) and re.search(r"[*?[]", word):
-            folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))  # its brackets are a name's
+            # The brackets of an existing folder are part of its name.
+            folder = next(parent for parent in Path(word).parents if os.path.isdir(parent))
             files = files_in(name, word, folder, files_like(folder, word), suffixes_of(modality))
         else:
             file = find_file(Path(), word)
             check_file(name, file, WANTED.get(modality, "an image file"))
             files = [file]
-        found += sorted(files, key=natural)
-    return found
+        all_files += sorted(files, key=natural)
+    return all_files
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:
-    """The files below a folder that a pattern names, each once; `glob` would follow a loop of links forty times."""
-    wanted = Path(pattern).relative_to(folder).parts
-    if "**" in wanted:
+    """The files below a folder that match a pattern, each once; `glob` would follow a loop of links forty times."""
+    pattern_parts = Path(pattern).relative_to(folder).parts
+    if "**" in pattern_parts:
         paths = files_below(folder)
     else:
-        paths = [folder / one for one in glob.glob(str(Path(*wanted)), root_dir=folder)]
-    return [path for path in paths if is_like(path.relative_to(folder).parts, wanted)]
+        paths = [folder / path for path in glob.glob(str(Path(*pattern_parts)), root_dir=folder)]
+    return [path for path in paths if is_like(path.relative_to(folder).parts, pattern_parts)]
 
 
 def is_like(parts: Sequence[str], pattern: Sequence[str]) -> bool:
-    """Whether the parts of a path are as those of a pattern; "**" stands for any number of folders."""
+    """Whether the parts of a path match those of a pattern; "**" matches any number of folders."""
     if not pattern:
         return not parts
     if pattern[0] == "**":
@@ -85,11 +86,18 @@ def is_like(parts: Sequence[str], pattern: Sequence[str]) -> bool:
 
 
 def files_in(name: str, place: str, folder: Path, paths: Iterable[Path], suffixes: Collection[str]) -> list[Path]:
-    """The files with some suffixes among a place's paths in a folder, at least one; says how many are left out."""
+    """The files with some suffixes among `paths` in a folder, at least one; notes how many are left out.
+
+    `place` is the folder or pattern as the user typed it, for the message.
+    """
     files = [path for path in paths if os.path.isfile(path)]
     kept = [file for file in files if file.suffix.lower() in suffixes and not is_hidden(file.relative_to(folder))]
     if not kept:
-        what = "images" if SOUNDS.isdisjoint(suffixes) else "sounds" if {*suffixes} <= SOUNDS else "inputs"
+        what = "inputs"
+        if SOUNDS.isdisjoint(suffixes):
+            what = "images"
+        elif {*suffixes} <= SOUNDS:
+            what = "sounds"
         raise InvalidInputError(f"`{name}` is {place!r}, where there are no {what}; name another folder or pattern.")
     if len(kept) < len(files):
         note(f"{len(files) - len(kept)} other files in {folder} are left out.")
@@ -102,7 +110,7 @@ def files_in(name: str, place: str, folder: Path, paths: Iterable[Path], suffixe
 def load_pipeline(
     name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu", quiet: bool = True, **unknown: Any
 ) -> Any:
-    """A pipeline, by its built-in name and a command's options: of a folder or repository, or built in."""
+    """The pipeline of a folder or repository, or the built-in one, by a command's options."""
     check_arguments("`load_pipeline`", unknown, ("model", "dtype", "device", "quiet"))
     weights_dtype = check_dtype("--dtype", dtype or "float32")
     place = device_of(device)
@@ -111,7 +119,7 @@ def load_pipeline(
 
     from unitouch_gen.pipelines.tiny import PIPELINES, TURBO, tiny
 
-    diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # what diffusers logs as an error it raises as well
+    diffusers.utils.logging.set_verbosity(logging.CRITICAL)  # diffusers raises whatever it logs as an error
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
@@ -135,8 +143,10 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
 
     transformers.utils.logging.disable_progress_bar()
     take_one_thread(model)
-    folder = joint = processor = JOINT if model is None else folder_of(model)
-    if (folder / "model_index.json").is_file():
+    folder = JOINT if model is None else folder_of(model)
+    joint = folder
+    processor = folder
+    if (folder / "model_index.json").is_file():  # a saved pipeline
         joint = folder / "unitouch"
         processor = folder / "processor"
     with reading("--model", folder):
@@ -155,31 +165,32 @@ def take_one_thread(model: str | None) -> None:
 
 
 def folder_of(model: str) -> Path:
-    """The folder of a model; a repository is fetched first. A name without an owner is taken for a mistyped folder."""
+    """The folder of a model; a repository is fetched first. Raises for a name that is no folder and has no owner."""
     if not os.path.isdir(model) and model.count("/") != 1:
         raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
     return local_folder("--model", model)
 
 
 def kind_of(model: str, kinds: Iterable[str] = DRAWING) -> str:
-    """The built-in name of a saved pipeline, which has to be one of some kinds."""
+    """The built-in name of a saved pipeline; raises if it is none of `kinds`."""
     from unitouch_gen.pipelines.tiny import PIPELINES
 
     name = class_name(read_settings("--model", folder_of(model) / "model_index.json"))
-    known = {PIPELINES[kind].__name__: kind for kind in kinds}
-    if name not in known:
-        raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(known)}.")
-    return known[name]
+    kind_by_class = {PIPELINES[kind].__name__: kind for kind in kinds}
+    if name not in kind_by_class:
+        classes = ", ".join(kind_by_class)
+        raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {classes}.")
+    return kind_by_class[name]
 
 
 def device_of(name: str) -> Any:
-    """The torch.device of a name, or what there is for "auto"."""
+    """The torch.device of a name; "auto" is a GPU if there is one, else the CPU."""
     import torch
 
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        torch.empty(1, device=name).cpu()  # which meta, a device without numbers, refuses
+        torch.empty(1, device=name).cpu()  # raises for meta, a device without data
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise InvalidInputError(f"`--device` is {name!r}, which cannot be used here; pass cpu or cuda.") from error
     return torch.device(name)

@@ -1,6 +1,7 @@
-"""`unitouch-gen work-precision` and `stability`: error, run time and extreme cases of solvers on any checkpoint."""
+"""`unitouch-gen work-precision` and `stability`: error against run time, and extreme cases, on any checkpoint."""
 
 import warnings
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,18 +16,18 @@ from unitouch_gen.weights import FAMILY
 
 
 def work_precision(
-    output: Annotated[Path, Option("--output", "-o", help="A folder for the chart and the results.")],
-    problem: Annotated[str | None, Option(help="An exact problem, such as mixture-7.5.")] = None,
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the chart and the results.")],
+    problem: Annotated[str | None, Option(help="A problem with a known flow, such as mixture-7.5.")] = None,
     pipeline: Annotated[str | None, Option(help=f"{', '.join(DRAWING)}.")] = None,
     model: Model = None,
     lora: Annotated[
         Path | None, Option(exists=True, help="Folder of LoRA weights by distill, charted as turbo; or built-in.")
     ] = None,
-    solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
-    steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
+    solvers: Annotated[str | None, Option(help="Names of solvers, by comma; all if left out.")] = None,
+    steps: Annotated[str, Option(help="Numbers of steps, by comma.")] = "5,8,12,20,32,50",
     tolerances: Annotated[str, Option(help="Tolerances, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
     guidance_scale: Guidance = None,
-    seeds: Annotated[int, Option(min=1, max=1000, help="Noises to start from, for each contact.")] = 4,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Number of noises for each contact.")] = 4,
 ) -> None:
     """Charts the error of solvers against their run time.
 
@@ -46,16 +47,14 @@ def work_precision(
     built_in = FAMILY / str(pipeline) / "turbo"
     if lora is None and model is None and built_in.is_dir() and find_spec("peft"):
         lora = built_in
-    left_out = {"turbo": lora is None, "default": pipeline is None}
-    known = [name for name in wp.NAMES if not left_out.get(name)]
-    names = dict.fromkeys(by_comma(solvers) or known)
+    unavailable = {"turbo": lora is None, "default": pipeline is None}
+    known = [name for name in wp.NAMES if not unavailable.get(name)]
+    names = list(dict.fromkeys(by_comma(solvers) or known))
     counts = [check_integer("--steps", value_of(word), 1, 1000) for word in steps.split(",")]
     errors = [check_number("--tolerances", value_of(word), 1e-5, 1.0) for word in tolerances.split(",")]
-    points: list[dict[str, Any]] = []
     for name in names:
-        kind, values = ("tolerance", errors) if name == "tolerance" else ("steps", counts)
-        values = wp.TURBO_STEPS if name == "turbo" else values
-        points += [{"solver": check_choice("--solvers", name, known), kind: value} for value in values]
+        check_choice("--solvers", name, known)
+    points = points_of(names, counts, errors)
 
     if problem is not None:
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
@@ -74,23 +73,51 @@ def work_precision(
     rows = [wp.measure(target, **point) for point in tqdm(points, disable=None)]
     wp.save(output, target, rows)
     echo(f"{target.name}, guidance {target.guidance_scale:g}; the reference's own error is {target.own_error:.1e}")
-    reached = (0.2, 0.1, 0.05, 0.02, 0.01)
-    table = list[list[str]]()
-    for name in names:
-        own = sorted((row for row in wp.successful(rows) if row["solver"] == name), key=lambda row: row["evaluations"])
-        enough = [next((row for row in own if row["error"] <= error), None) for error in reached]
-        cells = [f"{wp.amount(row)}, {row['seconds']:.2g} s" if row else "-" for row in enough]
-        table.append([name, *(["adds noise"] * len(reached) if name in target.noisy else cells)])
-    print_table(["for an error of", *(f"{error:.0%}" for error in reached)], table)
+    print_costs(target, names, rows)
     for row in rows:
         if row["failures"]:
             echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")
     echo(f"Chart and results are in {output.resolve()}")
 
 
+def points_of(names: Sequence[str], steps: Sequence[int], tolerances: Sequence[float]) -> list[dict[str, Any]]:
+    """The solvers to measure, each with its numbers of steps or tolerances."""
+    from unitouch_gen.numerics.work_precision import TURBO_STEPS
+
+    points = list[dict[str, Any]]()
+    for name in names:
+        if name == "tolerance":
+            points += [{"solver": name, "tolerance": value} for value in tolerances]
+        else:
+            points += [{"solver": name, "steps": value} for value in (TURBO_STEPS if name == "turbo" else steps)]
+    return points
+
+
+def print_costs(target: Any, names: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Prints what each solver takes to reach some errors."""
+    from unitouch_gen.numerics import work_precision as wp
+
+    bounds = (0.2, 0.1, 0.05, 0.02, 0.01)
+    table = list[list[str]]()
+    for name in names:
+        results = [row for row in wp.successful(rows) if row["solver"] == name]
+        results.sort(key=lambda row: row["evaluations"])
+        cells = list[str]()
+        for bound in bounds:
+            sufficient = [row for row in results if row["error"] <= bound]
+            if name in target.noisy:
+                cells.append("adds noise")
+            elif sufficient:
+                cells.append(f"{wp.amount(sufficient[0])}, {sufficient[0]['seconds']:.2g} s")
+            else:
+                cells.append("-")
+        table.append([name, *cells])
+    print_table(["for an error of", *(f"{bound:.0%}" for bound in bounds)], table)
+
+
 def stability(
     model: Model = None,
-    only: Annotated[str | None, Option(help="Name of the one case to run.")] = None,
+    only: Annotated[str | None, Option(help="Name of a single case to run.")] = None,
 ) -> None:
     """Runs solvers and pipelines on stiff and extreme input; exits with 1 if a case fails.
 
@@ -104,24 +131,27 @@ def stability(
     def load(kind: str, dtype: Any) -> Any:
         return load_pipeline(kind, model=model, dtype=str(dtype).removeprefix("torch."))
 
-    known = {case.name: case for case in cases(load, [*DRAWING] if model is None else [kind_of(model)])}
-    table = [*known.values()] if only is None else [known[check_choice("--only", only, known)]]
+    kinds = list(DRAWING) if model is None else [kind_of(model)]
+    case_by_name = {case.name: case for case in cases(load, kinds)}
+    chosen = list(case_by_name.values())
+    if only is not None:
+        chosen = [case_by_name[check_choice("--only", only, case_by_name)]]
     diffusers.utils.logging.set_verbosity_error()
-    rows = []
+    rows = list[list[str]]()
     failed = 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of extreme input
-        for case in tqdm(table, disable=None, leave=False):
+        for case in tqdm(chosen, disable=None, leave=False):
             try:
                 value, bound = case.run()
             except Exception as error:  # the other cases still run
-                ok = False
+                holds = False
                 figures = ["-", f"{type(error).__name__}: {error}"]
             else:
-                ok = value <= bound
+                holds = value <= bound
                 figures = [f"{bound:.2g}", f"{value:.2g}"]
-            failed += not ok
-            rows.append([case.name, case.reason, *figures, "ok" if ok else "FAILED"])
+            failed += not holds
+            rows.append([case.name, case.reason, *figures, "ok" if holds else "FAILED"])
     print_table(["case", "reason of the bound", "bound", "result", ""], rows)
     echo(f"{len(rows) - failed} of {len(rows)} cases hold.")
     if failed:

@@ -1,4 +1,4 @@
-"""The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
+"""The page of `unitouch-gen app`: a tab for each pipeline, with inputs on the left and results on the right."""
 
 import html
 import math
@@ -34,27 +34,27 @@ TITLES = {
 # On phones, all tabs in one row.
 CSS = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"
 
-UPLOAD_BYTES = 20 * 2**20
-UPLOAD_SECONDS = 3600  # how long uploads and pictures stay on the disk
+UPLOAD_BYTES = 20 * 2**20  # largest upload
+UPLOAD_SECONDS = 3600  # after which uploads and pictures are deleted
 
 Fields = dict[str, Any]  # components of a tab, by the arguments of its pipeline's call
 
 
 class StoppedError(Exception):
-    """Ends a job whose user has pressed "Stop" or closed the page."""
+    """Ends a job after its user pressed "Stop" or closed the page."""
 
 
 class Jobs:
     """Events that stop the jobs of a page, by browser session and pipeline.
 
-    gradio's `cancels` lets a running function go on, and its page then shows an error.
+    gradio's `cancels` does not stop a running function, and its page then shows an error.
     """
 
     def __init__(self) -> None:
         self.stops: dict[tuple[str, str], threading.Event] = {}
 
     def expect(self, session: str, kind: str) -> None:
-        """Notes that a job is asked for, so that it can be stopped while it waits in the queue."""
+        """Registers a job, so that it can be stopped while it waits in the queue."""
         stop = self.stops.get((session, kind))
         if stop is None or stop.is_set():
             self.stops[session, kind] = threading.Event()
@@ -77,11 +77,12 @@ class Jobs:
 
     def stop(self, session: str, kind: str) -> None:
         """Stops the job that runs or waits, if there is one."""
-        if stop := self.stops.get((session, kind)):
+        stop = self.stops.get((session, kind))
+        if stop is not None:
             stop.set()
 
     def close(self, session: str) -> None:
-        """Stops all jobs of a session, which is over."""
+        """Stops all jobs of a session that has ended."""
         for key in [key for key in self.stops if key[0] == session]:
             self.stops.pop(key).set()
 
@@ -92,16 +93,16 @@ class Jobs:
 
 @contextmanager
 def serving(pipes: Mapping[str, Any], host: str, port: int) -> Iterator[gradio.Blocks]:
-    """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it asks no other host."""
+    """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`; it contacts no other host."""
     fetch_nothing()
     jobs = Jobs()
+    titles = {kind: title for kind, title in TITLES.items() if kind in pipes}
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(600, UPLOAD_SECONDS)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, touches of anything, and answers about touches.")
         with gradio.Tabs():
-            for kind, title in TITLES.items():
-                if kind in pipes:
-                    with gradio.Tab(title):
-                        tab(pipes[kind], kind, jobs)
+            for kind, title in titles.items():
+                with gradio.Tab(title):
+                    tab(pipes[kind], kind, jobs)
 
         def close(request: gradio.Request) -> None:
             jobs.close(str(request.session_hash))
@@ -111,8 +112,8 @@ def serving(pipes: Mapping[str, Any], host: str, port: int) -> Iterator[gradio.B
     page.launch(
         server_name=f"[{host}]" if ":" in host else host,
         server_port=port,
-        share=False,  # left out, it is True in hosted notebooks
-        run_history=False,  # which offers to save runs at Hugging Face
+        share=False,  # the default is True in hosted notebooks
+        run_history=False,  # would offer to save runs at Hugging Face
         enable_monitoring=False,
         max_file_size=UPLOAD_BYTES,
         theme=gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]),
@@ -129,43 +130,36 @@ def serving(pipes: Mapping[str, Any], host: str, port: int) -> Iterator[gradio.B
 
 
 def fetch_nothing() -> None:
-    """Has gradio refuse addresses in place of files, which it would fetch for whoever names them."""
+    """Makes gradio refuse addresses in place of files, which it would fetch for anyone."""
 
     async def refuse(hostname: str) -> str:
         raise page_error("An address was passed; upload the file, as this page fetches nothing.")
 
-    safehttpx.async_validate_url = refuse  # asked before each fetch, but for the hosts of this list
+    safehttpx.async_validate_url = refuse  # called before each fetch, except from hosts of this list
     processing_utils.PUBLIC_HOSTNAME_WHITELIST.clear()
 
 
 def tab(pipe: Any, kind: str, jobs: Jobs) -> None:
-    """The tab of a pipeline."""
-    asking = kind == "touch-to-text"
+    """Builds the tab of a pipeline."""
+    answers = kind == "touch-to-text"
     with gradio.Row():
         with gradio.Column():
             fields = FIELDS[kind](pipe)
-            if not asking:
+            if not answers:
                 fields |= solver_fields(pipe)
             with gradio.Row():
-                button = gradio.Button("Ask" if asking else "Make it", variant="primary", scale=3)
+                button = gradio.Button("Ask" if answers else "Make it", variant="primary", scale=3)
                 stop_button = gradio.Button("Stop", scale=1)
         with gradio.Column():
-            results: list[Any] = [
-                gradio.Textbox(label="Answer")
-                if asking
-                else gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
-                gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
-                gradio.Textbox(label="Run report", lines=3),
-                gradio.Textbox(label="Seed that was used", visible=not asking),
-            ]
+            results = result_fields(kind)
     bar = gradio.Progress()
 
     def expect(request: gradio.Request) -> None:
         jobs.expect(str(request.session_hash), kind)
 
-    def run(given: dict[Any, Any], request: gradio.Request, progress: gradio.Progress = bar) -> Any:
+    def run(inputs: dict[Any, Any], request: gradio.Request, progress: gradio.Progress = bar) -> Any:
         try:
-            values = values_of(fields, given)
+            values = values_of(fields, inputs)
             with jobs.running(str(request.session_hash), kind) as check:
                 return answer(pipe, kind, values, progress, check)
         except StoppedError:
@@ -184,34 +178,50 @@ def tab(pipe: Any, kind: str, jobs: Jobs) -> None:
         run,
         set(fields.values()),
         results,
-        preprocess=False,  # gradio's own opens pictures, and its errors quote the server's paths
+        preprocess=False,  # gradio's preprocessing opens pictures, and its errors quote the server's paths
         concurrency_id="pipelines",
         api_visibility="private",
     )
     stop_button.click(stop, queue=False, api_visibility="private")
 
 
+def result_fields(kind: str) -> list[Any]:
+    """The results of a tab: pictures or an answer, what the touch feels like, the run report and the seed."""
+    answers = kind == "touch-to-text"
+    first: Any
+    if answers:
+        first = gradio.Textbox(label="Answer")
+    else:
+        first = gradio.Gallery(label="Pictures", format="png", columns=2, height=600)
+    return [
+        first,
+        gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
+        gradio.Textbox(label="Run report", lines=3),
+        gradio.Textbox(label="Seed that was used", visible=not answers),
+    ]
+
+
 def page_error(message: str) -> gradio.Error:
-    """An error that the page shows as one line, with uploads by their names; gradio reads messages as HTML."""
-    folder = repr(get_upload_folder())[1:-1]  # as it is quoted
+    """An error that the page shows as one line, with uploads by their names; gradio renders messages as HTML."""
+    folder = repr(get_upload_folder())[1:-1]  # as messages quote it
     message = re.sub(re.escape(folder) + r"[\\/]+[0-9a-f]{64}[\\/]+", "", message)
     return gradio.Error(html.escape(message, quote=False), duration=None, print_exception=False)
 
 
-def values_of(fields: Fields, given: Mapping[Any, Any]) -> dict[str, Any]:
-    """Arguments of a call from what the browser sent: uploads as paths, numbers within their fields' bounds."""
+def values_of(fields: Fields, inputs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Arguments of a call from the browser's inputs: uploads as paths, numbers within their fields' bounds."""
     values = {}
-    for name, part in fields.items():
-        value = given[part]
+    for name, component in fields.items():
+        value = inputs[component]
         if value is None or value == "":
             continue
-        if isinstance(part, gradio.Image | gradio.Audio):
+        if isinstance(component, gradio.Image | gradio.Audio):
             value = value["path"]
             if not os.path.isfile(value):
                 raise InvalidInputError(f"`{name}` was uploaded more than an hour ago and is deleted; upload it again.")
-        elif isinstance(part, gradio.Slider | gradio.Number):
-            low = -math.inf if part.minimum is None else part.minimum
-            high = math.inf if part.maximum is None else part.maximum
+        elif isinstance(component, gradio.Slider | gradio.Number):
+            low = -math.inf if component.minimum is None else component.minimum
+            high = math.inf if component.maximum is None else component.maximum
             check_number(name, value, low, high)
         values[name] = value
     return values
@@ -249,10 +259,10 @@ def any_fields(pipe: Any) -> Fields:
 
 
 def asking_fields(pipe: Any) -> Fields:
-    asked = [topic.questions[0] for topic in TOPICS.values()]
+    questions = [topic.questions[0] for topic in TOPICS.values()]
     return {
         "touch": upload("touch", "Touch"),
-        "question": gradio.Dropdown(asked, value="How does it feel?", label="Question", allow_custom_value=True),
+        "question": gradio.Dropdown(questions, value="How does it feel?", label="Question", allow_custom_value=True),
     }
 
 
@@ -265,26 +275,26 @@ FIELDS = {
 
 
 def upload(modality: str, label: str) -> Any:
-    """A file of a modality, with samples."""
+    """An upload of a modality, with samples."""
     sources: Any = ["upload", "clipboard"]
     with gradio.Row():
         if modality == "audio":
-            part: Any = gradio.Audio(type="filepath", label=label)
+            component: Any = gradio.Audio(type="filepath", label=label)
         else:
-            part = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
+            component = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
         files = [[str(file)] for file in examples(modality).values()]
-        gradio.Examples(files, part, label="Samples", api_visibility="private")
-    return part
+        gradio.Examples(files, component, label="Samples", api_visibility="private")
+    return component
 
 
 def solver_fields(pipe: Any) -> Fields:
-    """Fields of all tabs."""
+    """Fields of all tabs with pictures."""
     steps = pipe.config.default_num_inference_steps
     guidance = pipe.config.default_guidance_scale
     with gradio.Accordion("Solver, seed, number of pictures", open=False):
         return {
             "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
-            # Shown as 0 even if it has no value.
+            # gradio shows 0 even if there is no value.
             "tolerance": gradio.Number(
                 0, label="Error of the latents, in place of steps if above 0", minimum=0, maximum=1
             ),
@@ -297,7 +307,7 @@ def solver_fields(pipe: Any) -> Fields:
 
 
 def answer(
-    pipe: Any, kind: str, given: dict[str, Any], progress: gradio.Progress, check: Callable[[], None]
+    pipe: Any, kind: str, arguments: dict[str, Any], progress: gradio.Progress, check: Callable[[], None]
 ) -> tuple[Any, ...]:
     """Pictures or the answer, what the touch feels like, the run report and the seed.
 
@@ -305,26 +315,28 @@ def answer(
     """
     if kind == "touch-to-text":
 
-        def go_on(tokens: torch.Tensor, scores: Any, **others: Any) -> torch.Tensor:
+        def never_stop(tokens: torch.Tensor, scores: Any, **others: Any) -> torch.Tensor:
             check()
             return torch.zeros(len(tokens), dtype=torch.bool, device=tokens.device)
 
-        output = pipe(**given, stopping_criteria=StoppingCriteriaList([go_on]))
+        output = pipe(**arguments, stopping_criteria=StoppingCriteriaList([never_stop]))
         return output.texts[0], "", str(output.report), ""
-    seed = check_integer("seed", given.pop("seed", random.randrange(2**31)), 0)
-    unused = "num_inference_steps" if given.get("tolerance") else "tolerance"
-    given.pop(unused, None)
+    seed = check_integer("seed", arguments.pop("seed", random.randrange(2**31)), 0)
+    unused = "num_inference_steps" if arguments.get("tolerance") else "tolerance"
+    arguments.pop(unused, None)
 
     def show(view: Any, step: int, timestep: Any, tensors: Any) -> dict[str, Any]:
         check()
-        progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
+        progress((step + 1, arguments.get("num_inference_steps")), desc="Denoising")
         return {}
 
-    count = check_integer("num_images_per_prompt", given.get("num_images_per_prompt", 1), 1)
+    count = check_integer("num_images_per_prompt", arguments.get("num_images_per_prompt", 1), 1)
     generators = [torch.Generator().manual_seed(seed + number) for number in range(count)]
-    output = pipe(**given, generator=generators, callback_on_step_end=show)
-    felt = ""
-    if kind == "touch-to-image" and "text" in pipe.unitouch.known_modalities and pipe.processor.tokenizer is not None:
+    output = pipe(**arguments, generator=generators, callback_on_step_end=show)
+    feels_like = ""
+    reads_text = "text" in pipe.unitouch.known_modalities and pipe.processor.tokenizer is not None
+    if kind == "touch-to-image" and reads_text:
         classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
-        felt = str(classifier(given["touch"], sensor=given.get("sensor"), top=3)[0])
-    return output.images, felt, str(output.report), str(seed)
+        named = classifier(arguments["touch"], sensor=arguments.get("sensor"), top=3)[0]
+        feels_like = str(named)
+    return output.images, feels_like, str(output.report), str(seed)

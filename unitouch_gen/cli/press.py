@@ -1,4 +1,4 @@
-"""`unitouch-gen press`: touches of one's own height maps."""
+"""`unitouch-gen press`: touch images of height maps."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from unitouch_gen.cli.pictures import save, unique
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import replacing
 
-MM_PER_LEVEL = 1e-4  # of depth maps: 65,535 levels reach 6.5 mm, which is more than any gel is thick
+MM_PER_LEVEL = 1e-4  # of depth maps; 65,535 levels reach 6.5 mm, more than the thickness of any gel
 
 
 def press(
@@ -22,8 +22,8 @@ def press(
     output: options.Output,
     mm: Annotated[float, Option(help="Width of each map, mm.")] = 30.0,
     relief_mm: Annotated[float, Option(help="Height from black to white, mm; factor on float TIFF and .npy.")] = 1.0,
-    sensor: Annotated[list[str] | None, Option(help="Such as digit, the default, or all; repeatable.")] = None,
-    depth: Annotated[float, Option(help="How far the surface is pushed beyond first contact, mm.")] = 1.0,
+    sensor: Annotated[list[str] | None, Option(help="Name of a sensor, digit by default, or all; repeatable.")] = None,
+    depth: Annotated[float, Option(help="Depth of the surface beyond first contact, mm.")] = 1.0,
     at: Annotated[list[str] | None, Option(help="Place of a contact: X,Y in mm from the centre; repeatable.")] = None,
     image_size: Annotated[int, Option("--image-size", "--size", help="Side of the images, pixels.")] = 128,
     depth_maps: Annotated[bool, Option("--depth-maps", metavar="", help="Write depth maps, 16-bit PNG, too.")] = False,
@@ -34,7 +34,7 @@ def press(
     """Makes touch images of height maps, by any sensor.
 
     Floats are heights in mm; 8 and 16 bit images run from 0 to `--relief-mm`. Images are named after map, sensor and
-    contact. With `--depth-maps`, a depth map beside each says in its metadata how many mm a level and a pixel are.
+    contact. With `--depth-maps`, a depth map is written beside each, with mm per level and per pixel in its metadata.
 
     Example: unitouch-gen press example:coin --mm 24 --sensor all -o touches/
     """
@@ -47,39 +47,52 @@ def press(
 
     names = list(SENSORS) if sensor and "all" in sensor else sensor or ["digit"]
     names = list(dict.fromkeys(check_choice("--sensor", name, SENSORS) for name in names))
-    numbers = [f"-{number + 1}" if len(places) > 1 else "" for number in range(len(places))]
-    rows = [(file, name, number) for file in files for name in names for number in numbers]
-    targets = targets_of(output, unique([f"{file.stem}-{name}{number}" for file, name, number in rows]))
-    maps = [file.with_name(f"{file.stem}-depth.png") for file in targets] if depth_maps else []
+    stems = list[str]()
+    for file in files:
+        for name in names:
+            for number in range(1, len(places) + 1):
+                stems.append(f"{file.stem}-{name}-{number}" if len(places) > 1 else f"{file.stem}-{name}")
+    targets = targets_of(output, unique(stems))
+    maps = [target.with_name(f"{target.stem}-depth.png") for target in targets] if depth_maps else []
     if {os.path.realpath(file) for file in files} & {os.path.realpath(file) for file in [*targets, *maps]}:
         raise InvalidInputError(f"`--output` is {str(output)!r}, where a map would be replaced; name another place.")
     options.check_output([*targets, *maps], overwrite)
 
-    for file in files:  # a map that cannot be pressed should not end the work half done
+    for file in files:  # checked first, so that the work does not end half done
         height_maps(file, check_relief(relief_mm), name=f"height {file.name}")
-    made: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for file in files:
         for name in names:
-            done = pressed(file, mm, name, depth, relief_mm=relief_mm, at=places, image_size=image_size, seed=seed)
-            for touch, displacement in zip(done.touch, done.depth, strict=True):
-                target = targets[len(made)]
+            contacts = pressed(
+                file,
+                mm,
+                name,
+                depth,
+                relief_mm=relief_mm,
+                at=places,
+                image_size=image_size,
+                seed=seed,
+            )
+            for touch, displacement in zip(contacts.touch, contacts.depth, strict=True):
+                target = targets[len(rows)]
                 save(to_picture(touch), target)
                 row: dict[str, Any] = {"picture": str(target), "height": str(file), "sensor": name}
                 if depth_maps:
-                    row["depth_map"] = str(maps[len(made)])
-                    save_depth(displacement, maps[len(made)], done.field_of_view / image_size)
+                    depth_map = maps[len(rows)]
+                    row["depth_map"] = str(depth_map)
+                    save_depth(displacement, depth_map, contacts.field_of_view / image_size)
                 row["deepest_mm"] = round(float(displacement.max()), 4)
-                made.append(row)
+                rows.append(row)
     if as_json:
-        echo(json.dumps({"pictures": made, "mm_per_level": MM_PER_LEVEL}))
+        echo(json.dumps({"pictures": rows, "mm_per_level": MM_PER_LEVEL}))
         return
-    columns = list(made[0])
-    options.print_table(columns, [[Path(str(row[name])).name for name in columns] for row in made])
+    columns = list(rows[0])
+    options.print_table(columns, [[Path(str(row[name])).name for name in columns] for row in rows])
     echo(f"Touches are in {targets[0].resolve().parent}")
 
 
 def place_of(word: str) -> tuple[float, float]:
-    """A place, as an option gives it."""
+    """A place from the text of an option."""
     try:
         x, y = map(float, word.split(","))
     except ValueError as error:
@@ -88,7 +101,7 @@ def place_of(word: str) -> tuple[float, float]:
 
 
 def targets_of(output: Path, stems: list[str]) -> list[Path]:
-    """A file for each name: in a folder, or the one that is named."""
+    """A file for each name in a folder, or the one file that `output` names."""
     if not output.suffix or os.path.isdir(output):
         return [output / f"{stem}.png" for stem in stems]
     if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(stems) > 1:
