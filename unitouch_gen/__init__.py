@@ -54,19 +54,22 @@ __all__ = [
     "tiny",
 ]
 
-# Pictures are prepared with Pillow, so transformers need not tell everyone that torchvision is missing.
+# Pictures are prepared with Pillow, so transformers' note on missing torchvision is left out.
 logging.getLogger("transformers.utils.import_utils").addFilter(
     lambda record: "`CLIPImageProcessor` requires torchvision" not in record.getMessage()
 )
 
-_MODULES = ("errors", "examples", "models", "pipelines.tiny", "pipelines")  # what imports least comes first
+_MODULES = ("errors", "examples", "models", "pipelines.tiny", "pipelines")  # those with the fewest imports first
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    modules = (import_module(f"{__name__}.{module}") for module in _MODULES)
-    return next(getattr(module, name) for module in modules if hasattr(module, name))
+    for module_name in _MODULES:
+        module = import_module(f"{__name__}.{module_name}")
+        if hasattr(module, name):
+            return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

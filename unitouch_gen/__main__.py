@@ -1,4 +1,4 @@
-"""`python -m unitouch_gen`: what `unitouch-gen` does, also where its folder is not on the path."""
+"""`python -m unitouch_gen`: the same as `unitouch-gen`, also if its folder is not on the path."""
 
 from unitouch_gen.cli import main
 

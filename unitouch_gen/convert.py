@@ -1,9 +1,9 @@
-"""The checkpoints that ImageBind's and UniTouch's authors published, as the four encoders of a joint space.
+"""Conversion of the published checkpoints of ImageBind and UniTouch to the four encoders of a joint space.
 
-Both use one layout (Girdhar et al., 2023, "ImageBind"; the paper's release): `modality_preprocessors.M` hold stem and
-positions, `modality_trunks.M` the blocks, `modality_heads.M` norm and projection, M one of vision, text, audio and
-touch. UniTouch's file has "model." before every key. Its text head has no projection, so image, text and audio are read
-from ImageBind's file and touch from UniTouch's. The scales of their logits are left out.
+Both have the same layout (Girdhar et al., 2023, "ImageBind"; the paper's release), with M one of vision, text, audio
+and touch: `modality_preprocessors.M` are stem and positions, `modality_trunks.M` the blocks, `modality_heads.M` norm
+and projection. UniTouch's file has "model." before every key. Its text head has no projection, so image, text and audio
+are read from ImageBind's file, and touch from UniTouch's. The scales of their logits are left out.
 """
 
 import copy
@@ -29,21 +29,21 @@ from unitouch_gen.models.sensors import SensorBank
 from unitouch_gen.saving import filling
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
-"""Which encoders are read from which file."""
+"""Encoders that are read from each file."""
 
 # The layout -----------------------------------------------------------------------------------------------------------
 
 Rule = Callable[[Tensor], Tensor]
-"""Makes one of our tensors of a published one."""
+"""Converts a published tensor to one of this package."""
 
 SAME: Rule = torch.as_tensor
 WITHOUT_BATCH: Rule = partial(torch.squeeze, dim=0)
 STILL: Rule = partial(torch.sum, dim=2)
-"""A still picture is two equal frames to a stem over two, so that its kernel is the sum over time."""
+"""The published stem takes two frames, and a still picture is two equal ones, so its kernel is the sum over time."""
 
 
 def third(number: int) -> Rule:
-    """One of query, key and value, which are stacked."""
+    """Query, key or value (0, 1, 2) of the three stacked."""
     return lambda stacked: stacked.chunk(3)[number]
 
 
@@ -52,7 +52,7 @@ _BLOCK = r"blocks\.(\d+)"
 _LAYER = r"encoder\.layers\.(\d+)"
 
 Renaming = tuple[str, str, Rule]
-"""Pattern of our key, template of the published one, and the rule."""
+"""Pattern of a key of this package, template of the published key, and the rule."""
 
 VIT: tuple[Renaming, ...] = (
     (r"class_token", r"modality_preprocessors.M.cls_token", SAME),
@@ -100,12 +100,14 @@ RENAMINGS: dict[str, tuple[Renaming, ...]] = {
 
 
 def published_name(modality: str, key: str) -> tuple[str, Rule]:
-    """The published key of one of `UniTouchModel`'s, and what makes ours of it; raises `KeyError` if there is none."""
+    """The published key of a key of `UniTouchModel`, and the rule; raises `KeyError` if there is none."""
     prefix = f"{MODULES[modality][0]}."
-    short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats that of image and text
+    short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats the prefix of image and text
+    published_modality = "vision" if modality == "image" else modality
     for pattern, template, rule in RENAMINGS[modality]:
-        if match := re.fullmatch(pattern, short):
-            return match.expand(template.replace("M", "vision" if modality == "image" else modality, 1)), rule
+        match = re.fullmatch(pattern, short)
+        if match:
+            return match.expand(template.replace("M", published_modality, 1)), rule
     raise KeyError(key)
 
 
@@ -115,45 +117,49 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
 def _read_published(
     files: Mapping[str, str | os.PathLike | None], config: UniTouchConfig, dtype: torch.dtype | None
 ) -> UniTouchModel:
-    """A joint space of the published `FILES`, which are named by the arguments of `convert_published`."""
+    """A joint space from the published `FILES`, by the names of arguments of `convert_published`."""
     model: Any = UniTouchModel(config, modalities=()).eval()
     for name, file in files.items():
         if file is None:
             continue
         model.source = as_path(name, file)
-        keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, model.source).items()}
+        checkpoint = open_checkpoint(name, model.source)
+        published = {key.removeprefix("model."): tensor for key, tensor in checkpoint.items()}
         for modality in FILES[name]:
-            tensors = _encoder_in(f"`{name}` names {str(file)!r}, which", keys, config, modality)
+            tensors = _encoder_in(f"`{name}` names {str(file)!r}, which", published, config, modality)
             if not model.known_modalities:
                 model.to(dtype or next(iter(tensors.values())).dtype)
             model.load_tensors(modality, tensors)
     return model
 
 
-def _encoder_in(subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str) -> dict[str, Tensor]:
-    """The tensors of a modality in a published file of tensors `keys`, by our keys; `subject` begins messages."""
-    found = {}
+def _encoder_in(
+    subject: str, published: Mapping[str, Tensor], config: UniTouchConfig, modality: str
+) -> dict[str, Tensor]:
+    """The tensors of a modality, by keys of `UniTouchModel`, from published ones; `subject` begins messages."""
+    tensors = {}
     prefix = MODULES[modality][0]
     with torch.device("meta"):
         encoder = make_modules(config, modality)[prefix]
     for key in encoder.state_dict():
         source, rule = published_name(modality, key)
         try:
-            found[f"{prefix}.{key}"] = rule(check_finite(source, keys[source]))
-        except (KeyError, IndexError, RuntimeError) as error:  # the last two of too few dimensions
-            wrong = f"of the shape {tuple(keys[source].shape)}" if source in keys else "missing"
+            tensors[f"{prefix}.{key}"] = rule(check_finite(source, published[source]))
+        except (KeyError, IndexError, RuntimeError) as error:  # the last two if there are too few dimensions
+            wrong = f"of the shape {tuple(published[source].shape)}" if source in published else "missing"
             raise InvalidInputError(
                 f"{subject} is not laid out as the published {modality} encoder: {source} is {wrong}. `touch` is for "
                 "UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
             ) from error
-    if modality == "touch":  # and a bank of no sensors
-        bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
-        found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
-    return found
+    if modality == "touch":
+        width = config.touch_config.hidden_size  # type: ignore[union-attr]
+        bank = SensorBank((), config.sensor_tokens, width, config.prototype_size)  # without sensors
+        tensors |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
+    return tensors
 
 
 class Inert:
-    """Stands for what trainers leave beside the weights, of which nothing is made."""
+    """Replaces objects that trainers leave beside the weights, and does nothing."""
 
     def __new__(cls, *args: Any) -> "Inert":
         return super().__new__(cls)
@@ -172,40 +178,49 @@ LEFT_BY_TRAINERS: list[Any] = [
         "numpy.dtype",
     )
 ]
-"""Names in pickles of Lightning 1: its callbacks' states go by their classes, and their scores are numpy's."""
+"""Names in pickles of Lightning 1, whose callbacks store their states by class, and scores as numpy scalars."""
 
 
 def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     """The weights in a checkpoint, whose path was passed as the argument `name`.
 
-    It is a pickle of `torch.save`, also of a dict with the weights as "state_dict" or "model", or safetensors. A pickle
-    is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the format
-    since torch 1.6 stay in the file until they are used.
+    Checkpoints are safetensors, or pickles of `torch.save` of a state dict, or of a dict with one as "state_dict" or
+    "model". A pickle is read by torch's unpickler of tensors and plain containers, so no code in it is run. Tensors of
+    the format since torch 1.6 are read from the file when they are used.
 
     Raises:
-        InvalidInputError: If there is no such file, it is cut off, or holds anything but tensors and plain containers.
+        InvalidInputError: If there is no such file, it is cut off, or has other objects than tensors and plain
+            containers.
     """
     check_file(name, path, "a checkpoint")
     subject = f"`{name}` names {str(path)!r}, which"
     try:
         if Path(path).suffix == ".safetensors":
-            found: Any = load_file(path)
+            content: Any = load_file(path)
         else:
             with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
-                found = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
-    except Exception as error:  # a broken file makes its readers raise errors of many kinds
+                content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except Exception as error:  # readers of broken files raise many kinds of errors
         unsafe = re.search(r"GLOBAL:? (\S+)", str(error), re.IGNORECASE)
         if isinstance(error, pickle.UnpicklingError) and unsafe:
             why = f"holds more than weights: {unsafe[1]}, of which nothing was run. Pass a file of weights alone"
         else:
             why = f"cannot be read as a checkpoint ({first_line(error)}): it is cut off, or something else"
         raise InvalidInputError(f"{subject} {why}.") from error
-    found = found.get("state_dict", found.get("model", found)) if isinstance(found, Mapping) else {}
-    tensors = {key: value for key, value in found.items() if isinstance(value, Tensor) and value.is_floating_point()}
-    tensors = {key: value for key, value in tensors.items() if value.layout == torch.strided and not value.is_meta}
+    state: Any = {}
+    if isinstance(content, Mapping):
+        state = content.get("state_dict", content.get("model", content))
+    tensors = {key: value for key, value in state.items() if is_weight(value)}
     if not tensors:
         raise InvalidInputError(f"{subject} holds no weights; pass a state dict.")
     return tensors
+
+
+def is_weight(value: Any) -> bool:
+    """Whether an object is a dense tensor of floating-point numbers."""
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        return False
+    return value.layout == torch.strided and not value.is_meta
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
@@ -225,19 +240,19 @@ def convert_published(
 
     Args:
         output: The folder.
-        touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
-        imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are read.
+        touch: UniTouch's file (`last_new.ckpt`), for the touch encoder. It has no sensor tokens.
+        imagebind: ImageBind's file (`imagebind_huge.pth`), for image, text and audio.
         tokenizer: Folder of the tokenizer of text: OpenCLIP's, as in Stable Diffusion 2.1 unCLIP.
         config: Sizes of encoders other than the published ones, without sensors.
-        dtype: Precision of the weights; the file's own when left out.
-        max_shard_size: Size of the largest file of weights, which is also what is held in memory at a time.
+        dtype: Precision of the weights; the file's own if left out.
+        max_shard_size: Size of the largest file of weights, which is also the memory that is used.
 
     Returns:
         What the folder lacks, in words.
 
     Raises:
-        InvalidInputError: If neither file is given, or one is none of these, lacks tensors, or holds some that are
-            not finite; or if the output holds something else or cannot be written to. Nothing is changed then.
+        InvalidInputError: If neither file is given; if a file is no such checkpoint, lacks tensors, or has values that
+            are not finite; or if the output holds a model or cannot be written to. Nothing is changed then.
     """
     output = as_path("output", output)
     config = check_kind("config", UniTouchConfig() if config is None else copy.deepcopy(config), UniTouchConfig)
@@ -245,17 +260,18 @@ def convert_published(
         raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
     if config.sensors:
         raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
-    wanted = None if dtype is None else check_dtype("dtype", dtype)
-    words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
+    weights_dtype = None if dtype is None else check_dtype("dtype", dtype)
+    text_tokenizer = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
     check_writable("output", output / "config.json")
-    model = _read_published({"imagebind": imagebind, "touch": touch}, config, wanted)
-    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
-    lacks += ["sensor tokens, which were not published"] if "touch" in model.known_modalities else []
-    if not words:
-        lacks.append("a tokenizer, which `tokenizer` would bring")
+    model = _read_published({"imagebind": imagebind, "touch": touch}, config, weights_dtype)
+    missing = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
+    if "touch" in model.known_modalities:
+        missing.append("sensor tokens, which were not published")
+    if not text_tokenizer:
+        missing.append("a tokenizer, which `tokenizer` would bring")
     with filling("output", output) as folder:
         model.save_pretrained(folder, max_shard_size=max_shard_size)
-        UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
-    return lacks
+        UniTouchProcessor.for_config(model.config, text_tokenizer).save_pretrained(folder)
+    return missing

@@ -1,4 +1,4 @@
-"""Files that are written whole, and files, folders and tables that are read with errors that name the argument."""
+"""Atomic writing of files, and reading of files, folders and tables with errors that name the argument."""
 
 import csv
 import errno
@@ -51,7 +51,7 @@ LOADING_OPTIONS = (
     "use_safetensors",
     "variant",
 )
-"""Options that diffusers and transformers pass to every `from_pretrained`, and those of downloads."""
+"""Options that diffusers and transformers pass to every `from_pretrained`, and options of downloads."""
 
 _LOADING = threading.RLock()  # libraries patch torch in all threads while they read networks
 
@@ -59,30 +59,29 @@ _LOADING = threading.RLock()  # libraries patch torch in all threads while they 
 # Writing --------------------------------------------------------------------------------------------------------------
 
 UNFINISHED = ".unfinished-save"
-"""Lies in a folder while files of a save take their places, and says which; stays there if the save is cut off."""
+"""The plan of a save, in its folder while files take their places; it remains if the save is cut off."""
 
 
 @contextmanager
 def writing_to(name: str, target: Path) -> Iterator[None]:
-    """Turns errors of writing into one that names the argument."""
+    """Turns errors of writing into an `InvalidInputError` that names the argument."""
     try:
         yield
     except Exception as error:
-        is_os_error = isinstance(error, OSError) or "(os error" in str(error)  # the second of libraries in Rust
-        is_name = isinstance(error, UnicodeEncodeError)  # of which these want UTF-8
+        is_os_error = isinstance(error, OSError) or "(os error" in str(error)  # the latter from libraries in Rust
+        is_name = isinstance(error, UnicodeEncodeError)  # those libraries take names in UTF-8
         if isinstance(error, InvalidInputError) or not (is_os_error or is_name):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
-        raise InvalidInputError(
-            f"`{name}` cannot be written to {str(target)!r}: {why}. Nothing was changed."
-        ) from error
+        message = f"`{name}` cannot be written to {str(target)!r}: {why}. Nothing was changed."
+        raise InvalidInputError(message) from error
 
 
 @contextmanager
 def replacing(name: str, file: Path) -> Iterator[Path]:
-    """A path of the same name to write to, which takes the place of a file when the block ends without an error.
+    """A path of the same name to write to, which replaces `file` when the block ends without an error.
 
-    Raises `InvalidInputError` if it cannot be written, or is a folder or a device; what was there stays.
+    Raises `InvalidInputError` if it cannot be written, or is a folder or a device. The file is then unchanged.
     """
     target = Path(os.path.realpath(file))
     with writing_to(name, target):
@@ -91,29 +90,29 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
             partial = Path(hidden) / file.name
             yield partial
-            share_as_usual(partial, target)
+            set_permissions(partial, target)
             os.replace(partial, target)
 
 
 def write_file(name: str, file: Path, content: str | bytes) -> Path:
-    """Writes text, in UTF-8, or bytes, whole or not at all; returns the file."""
+    """Writes text, in UTF-8, or bytes, completely or not at all; returns the file."""
     with replacing(name, file) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
     return file
 
 
 def check_writable(name: str, file: Path) -> None:
-    """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
+    """Raises `InvalidInputError`, before any work, if a file cannot be written. Nothing is left behind."""
     target = Path(os.path.realpath(file))
     with writing_to(name, target):
         check_replaceable(target)
         # os.path.exists is False for a name that is too long, where Path.exists raises.
-        above = next(parent for parent in target.parents if os.path.exists(parent))
-        tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above).cleanup()
+        existing = next(parent for parent in target.parents if os.path.exists(parent))
+        tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=existing).cleanup()
 
 
-def share_as_usual(file: Path, destination: Path) -> None:
-    """Gives a file the permissions of the one that it replaces, or of a new one; safetensors' own are 0600."""
+def set_permissions(file: Path, destination: Path) -> None:
+    """Gives a file the permissions of the file that it replaces, or of a new file; safetensors writes with 0600."""
     if os.path.exists(destination):
         mode = destination.stat().st_mode & 0o777
     else:
@@ -121,28 +120,28 @@ def share_as_usual(file: Path, destination: Path) -> None:
         probe.touch()
         mode = probe.stat().st_mode & 0o777
         probe.unlink()
-    with suppress(OSError):  # of file systems without permissions
+    with suppress(OSError):  # raised by file systems without permissions
         file.chmod(mode)
 
 
 def check_replaceable(file: Path) -> None:
-    """Raises `FileExistsError` where there is something other than a file."""
+    """Raises `FileExistsError` if there is something other than a file."""
     if os.path.exists(file) and not os.path.isfile(file):
         raise FileExistsError(errno.EEXIST, f"{file.name} is a folder or a device")
 
 
 @contextmanager
 def locked(folder: Path, *, shared: bool = False) -> Iterator[None]:
-    """Holds a lock on a folder, so that saves do not mix with each other or, `shared`, with a reader.
+    """Holds a lock on a folder, so that saves do not mix with each other. Readers hold a `shared` lock.
 
-    Without one where the system has none.
+    On a system without locks, it does nothing.
     """
     if fcntl is None or not os.path.isdir(folder):
         yield
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with suppress(OSError):  # of file systems without locks
+        with suppress(OSError):  # raised by file systems without locks
             fcntl.flock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
         yield
     finally:
@@ -155,28 +154,28 @@ def is_unfinished(folder: Path) -> bool:
 
 
 def finish_save(folder: Path) -> None:
-    """Finishes a save that was decided: its files take their places, and older weights of the same components go.
+    """Finishes a save whose plan is written: its files take their places, older weights of its components are removed.
 
-    The folder is `locked`. A plan that leads out of the folder is refused.
+    The folder has to be `locked`. Raises if the plan names paths outside of the folder.
     """
     if not is_unfinished(folder):
         return
     try:
         plan = json.loads((folder / UNFINISHED).read_text())
-        parts = [*(part for move in plan["moves"] for part in move), *plan["removed"]]
-        moves = [(folder / beside, folder / destination) for beside, destination in plan["moves"]]
-        removed = [folder / part for part in plan["removed"]]
+        moves = [(folder / hidden, folder / destination) for hidden, destination in plan["moves"]]
+        removed = [folder / name for name in plan["removed"]]
+        names = [name for move in plan["moves"] for name in move] + list(plan["removed"])
     except (ValueError, TypeError, LookupError) as error:
         raise InvalidInputError(f"`{folder / UNFINISHED}` is no plan of a save; save again.") from error
-    if any(Path(part).is_absolute() or ".." in Path(part).parts for part in parts):
+    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in names):
         raise InvalidInputError(f"`{folder / UNFINISHED}` leads out of its folder.")
-    for beside, destination in moves:
-        if os.path.lexists(beside):  # and is not in its place yet
-            os.replace(beside, destination)
-    inside = os.path.realpath(folder)
+    for hidden, destination in moves:
+        if os.path.lexists(hidden):  # it has not been moved yet
+            os.replace(hidden, destination)
+    real_folder = os.path.realpath(folder)
     for file in removed:
-        # A plan that came with a downloaded folder could name files behind a link.
-        if os.path.commonpath([inside, os.path.realpath(file.parent)]) == inside:
+        # A plan in a downloaded folder could name files behind a link.
+        if os.path.commonpath([real_folder, os.path.realpath(file.parent)]) == real_folder:
             file.unlink(missing_ok=True)
     (folder / UNFINISHED).unlink()
 
@@ -194,7 +193,7 @@ def as_path(name: str, place: Any) -> Path:
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     """A folder as it is, or the local copy of a repository, without files that are `NEVER_READ`.
 
-    Of the options, which are those of `from_pretrained`, the ones of a fetch are used.
+    `options` are those of `from_pretrained`, of which the options of downloads are used.
     """
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
@@ -203,68 +202,81 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; pass one, or a repository id.")
     from huggingface_hub import snapshot_download
 
-    known = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
-    given = {key: options[key] for key in known if options.get(key) is not None}
+    names = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
+    download_options: dict[str, Any] = {"ignore_patterns": NEVER_READ}
+    for option in names:
+        if options.get(option) is not None:
+            download_options[option] = options[option]
     try:
-        return Path(snapshot_download(str(place), **{"ignore_patterns": NEVER_READ, **given}))
-    except (OSError, ValueError, ImportError) as error:  # the last two: of what is no id, of a proxy by SOCKS
+        return Path(snapshot_download(str(place), **download_options))
+    except (OSError, ValueError, ImportError) as error:  # ValueError: no id; ImportError: a SOCKS proxy
         why = f"no folder here, and no repository that can be fetched: {first_line(error)}"
         raise InvalidInputError(f"`{name}` is {str(place)!r}, {why}") from error
 
 
 def natural(path: str | Path) -> list[Any]:
     """A key to sort names by, with numbers in them as numbers: 2.png before 10.png."""
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
+    parts = re.split(r"(\d+)", str(path))  # texts and numbers in turn
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
 def files_below(folder: Path) -> list[Path]:
-    """The files in a folder and those below, in natural order; also behind links, where each folder is entered once.
+    """The files in a folder and below, in natural order, also behind links. Each folder is entered once.
 
-    A folder that may not be read counts as empty. One that is there by its own name and behind a link goes by its own.
+    A folder that cannot be read counts as empty. A folder that is reached by its own name and by a link has its own
+    name.
     """
-    files: list[Path] = []
-    waiting = [folder]
-    links: list[Path] = []
+    files = list[Path]()
+    folders = [folder]
+    links = list[Path]()
     entered = set[str]()
-    while waiting or links:
-        place = waiting.pop() if waiting else links.pop(0)
-        real = os.path.realpath(place)
-        if real in entered:
+    while folders or links:
+        current = folders.pop() if folders else links.pop(0)
+        real_path = os.path.realpath(current)
+        if real_path in entered:
             continue
-        entered.add(real)
-        with suppress(OSError), os.scandir(place) as entries:
-            for entry in entries:
-                path = place / entry.name
-                if os.path.isfile(path):
-                    files.append(path)
-                elif os.path.isdir(path):
-                    (links if entry.is_symlink() else waiting).append(path)
+        entered.add(real_path)
+        for path in _entries_in(current):
+            if os.path.isfile(path):
+                files.append(path)
+            elif os.path.islink(path) and os.path.isdir(path):
+                links.append(path)
+            elif os.path.isdir(path):
+                folders.append(path)
     return sorted(files, key=natural)
 
 
-def find_file(folder: Path, name: str) -> Path:
-    """The file of a name in a folder, also where the disk composes its letters in another way than a table does.
+def _entries_in(folder: Path) -> list[Path]:
+    """The entries of a folder; none if it cannot be read."""
+    try:
+        return [folder / name for name in os.listdir(folder)]
+    except OSError:
+        return []
 
-    Tables hold composed letters (NFC); macOS and some archives leave decomposed ones (NFD) on disks.
+
+def find_file(folder: Path, name: str) -> Path:
+    """The file of a name in a folder, also if the disk has another Unicode form of the name.
+
+    Tables have composed letters (NFC). macOS and some archives leave decomposed ones (NFD) on disks.
     """
-    found = folder
+    path = folder
     for part in Path(name).parts:
-        exact = found / part
-        if not os.path.lexists(exact) and os.path.isdir(found):
-            wanted = unicodedata.normalize("NFC", part)
-            same = (other for other in os.listdir(found) if unicodedata.normalize("NFC", other) == wanted)
-            exact = found / next(same, part)
-        found = exact
-    return found
+        exact = path / part
+        if not os.path.lexists(exact) and os.path.isdir(path):
+            composed = unicodedata.normalize("NFC", part)
+            same = (entry for entry in os.listdir(path) if unicodedata.normalize("NFC", entry) == composed)
+            exact = path / next(same, part)
+        path = exact
+    return path
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a path in a folder of the user's is what systems and programs leave there for themselves."""
+    """Whether a path is hidden, or left by a system or program for itself."""
     return any(part.startswith((".", "~$")) or part in ("@eaDir", "__MACOSX", "$RECYCLE.BIN") for part in path.parts)
 
 
 def read_text(file: Path) -> str:
-    """A text in UTF-8, or in UTF-16 as spreadsheets write it; nothing where there is no file."""
+    """A text in UTF-8, or in UTF-16 as spreadsheets write it; empty if there is no file."""
     content = file.read_bytes() if file.is_file() else b""
     if file.is_file() and is_lfs_pointer(file):
         raise InvalidInputError(f"{str(file)!r} is a Git LFS pointer; run `git lfs pull` in its repository.")
@@ -275,41 +287,66 @@ def read_text(file: Path) -> str:
 
 
 def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
-    """The rows of a table, parted by commas, semicolons or tabs, by the names in its first line; without blank ones."""
+    """The rows of a table, by the names of its columns, without blank rows.
+
+    Columns are separated by commas, semicolons or tabs. Their names are in the first line, or in `header`.
+    """
     text = read_text(file)
-    if said := re.match(r'"?sep=(.)"?\r?\n', text):  # to Excel
-        text = text[said.end() :]
-    delimiter = said[1] if said else max(",;\t", key=text.lstrip().partition("\n")[0].count)
+    first, _, _ = text.lstrip().partition("\n")
+    delimiter = max(",;\t", key=first.count)
+    declaration = re.match(r'"?sep=(.)"?\r?\n', text)  # read by Excel
+    if declaration:
+        delimiter = declaration[1]
+        text = text[declaration.end() :]
     lines = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
     try:
         cells = [[cell.strip() for cell in row] for row in lines if any(map(str.strip, row))]
     except csv.Error as error:
         raise InvalidInputError(f"{str(file)!r} is no table: {error}, in line {lines.line_num}.") from error
-    names = header or [name.lower() for name in (cells.pop(0) if cells else ())]
-    if not header and len(names) > 1 and not names[0]:  # the row numbers of pandas
-        names = names[1:]
-        cells = [row[1:] for row in cells]
-    width = max((place for row in (names, *cells) for place, cell in enumerate(row, start=1) if cell), default=0)
+    if header:
+        names = list(header)
+    else:
+        names = [name.lower() for name in cells.pop(0)] if cells else []
+        if len(names) > 1 and not names[0]:  # row numbers of pandas
+            names = names[1:]
+            cells = [row[1:] for row in cells]
+    width = max(_filled_width(row) for row in (names, *cells))
     names = names[:width]
     cells = [row[:width] for row in cells]
-    odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
-    if not cells or odd or len(set(names)) < len(names):
-        wrong = f"other columns in row {', '.join(odd[:5])}; quote texts that hold commas" if odd else "two of one name"
-        raise InvalidInputError(f"{str(file)!r} has the columns {[*names]}, and {wrong if cells else 'no rows'}.")
+    _check_cells(file, names, cells)
     return [dict(zip(names, row, strict=True)) for row in cells]
 
 
+def _filled_width(row: Sequence[str]) -> int:
+    """The number of cells of a row up to its last one that is not blank."""
+    return max((place for place, cell in enumerate(row, start=1) if cell), default=0)
+
+
+def _check_cells(file: Path, names: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
+    """Raises if a table has no rows, rows of other widths, or two columns of one name."""
+    odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
+    wrong = ""
+    if not cells:
+        wrong = "no rows"
+    elif odd:
+        wrong = f"other columns in row {', '.join(odd[:5])}; quote texts that hold commas"
+    elif len(set(names)) < len(names):
+        wrong = "two of one name"
+    if wrong:
+        raise InvalidInputError(f"{str(file)!r} has the columns {[*names]}, and {wrong}.")
+
+
 def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.loads) -> dict[str, Any]:
-    """The settings in a file in UTF-8: JSON, or what another parser reads."""
+    """The settings in a file in UTF-8: JSON, or another format with its parser."""
     check_file(name, file, "a settings file")
     try:
-        found = parse(file.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError(f"it holds {describe(found)} and no settings")
-    except Exception as error:  # of the format, of dates, of integers of thousands of digits
+        settings = parse(file.read_text(encoding="utf-8"))
+        if not isinstance(settings, dict):
+            raise ValueError(f"it holds {describe(settings)} and no settings")
+    except Exception as error:  # parsers raise many kinds of errors
         why = first_line(error)
         raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read: {why}.") from error
-    return found
+    return settings
 
 
 SAVED_FILES = {
@@ -318,13 +355,13 @@ SAVED_FILES = {
     "processor": (["preprocessor_config.json"],),
     "tokenizer": (["tokenizer_config.json"], ["tokenizer.json", "vocab.*", "*.model"]),
 }
-"""Files of each kind of component, as patterns; of those in one list, any will do."""
+"""Files of each kind of component, as lists of patterns; one file of each list is needed."""
 
 
 def check_saved(folder: Path, kind: str) -> None:
-    """Raises if a folder lacks one of the `SAVED_FILES` of a kind, as after a download that stopped.
+    """Raises if a folder lacks one of the `SAVED_FILES` of a kind, as after an interrupted download.
 
-    Without them, transformers builds an empty tokenizer, or a network of its default size.
+    Without this check, transformers would build an empty tokenizer, or a network of its default size.
     """
     for patterns in SAVED_FILES[kind]:
         if not any(os.path.isfile(file) for pattern in patterns for file in folder.glob(pattern)):
@@ -333,24 +370,24 @@ def check_saved(folder: Path, kind: str) -> None:
 
 
 def check_filled(folder: Path, network: Any) -> None:
-    """Raises if a folder's files lack numbers of a network, which its library would draw at random."""
+    """Raises if a folder's files lack weights of a network, which its library would initialise at random."""
     from safetensors import safe_open
 
     sizes: dict[str, int] = {}
     for path in folder.glob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             for name in file.keys():  # noqa: SIM118 - not a dict
-                if ".base_layer." not in name and ".lora_" not in name:  # of no network by itself
+                if ".base_layer." not in name and ".lora_" not in name:  # adapters, which are no part of the network
                     sizes[name] = math.prod(file.get_slice(name).get_shape())
-    tensors = [*network.state_dict().values()]
-    lacking = [one for one in tensors if one.is_meta]
+    tensors = list(network.state_dict().values())
     # Tied weights are stored once.
-    held = sum(sizes.values())
-    wanted = sum({(one.data_ptr(), one.shape): one.numel() for one in tensors}.values())
-    if lacking or held < wanted:
+    unique = {(tensor.data_ptr(), tensor.shape): tensor.numel() for tensor in tensors}
+    stored = sum(sizes.values())
+    expected = sum(unique.values())
+    if stored < expected or any(tensor.is_meta for tensor in tensors):
         raise InvalidInputError(
-            f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
-            "network."
+            f"`{folder}` holds {stored} of the {expected} numbers of {type(network).__name__}; it is cut off or of "
+            "another network."
         )
 
 
@@ -366,7 +403,7 @@ def read_network(kind: Any, folder: Path, **options: Any) -> Any:
 
 
 def class_name(settings: dict[str, Any]) -> Any:
-    """The pipeline's class that a model_index.json names: a text, or [module, class] on the Hub."""
+    """The pipeline's class in a model_index.json, where it is a name, or on the Hub [module, name]."""
     name = settings.get("_class_name")
     return name[-1] if isinstance(name, list) and name else name
 
@@ -379,7 +416,10 @@ def model_files(place: Path) -> list[Path]:
 
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
-    """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
+    """Runs a block in which libraries read networks, one at a time.
+
+    Whatever they raise becomes an `InvalidInputError` that names the argument.
+    """
     import torch
 
     folder = as_path(name, place)
@@ -389,15 +429,21 @@ def reading(name: str, place: Any) -> Iterator[None]:
     # Inference tensors can never be trained.
     with _LOADING, torch.inference_mode(False), locked(folder, shared=True):
         try:
-            for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
-                read_settings(name, file)  # libraries name no file, and would wait for a pipe
+            if os.path.isdir(folder):
+                for file in sorted(folder.glob("*config.json")):
+                    read_settings(name, file)  # the errors of libraries name no file, and a pipe would block them
             yield
-        except Exception as error:  # of as many kinds as there are readers
+        except Exception as error:  # readers raise many kinds of errors
             if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
                 raise
-            if pointer := next(filter(is_lfs_pointer, model_files(folder)), None):
-                why = f"{str(pointer)!r} is a Git LFS pointer; run `git lfs pull` in its repository."
-                raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}") from error
-            why = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
-            hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
-            raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}{hint}") from error
+            why = _why_unreadable(folder, error)
+            raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {why}") from error
+
+
+def _why_unreadable(folder: Path, error: Exception) -> str:
+    """Why a folder's networks cannot be read."""
+    for file in model_files(folder):
+        if is_lfs_pointer(file):
+            return f"{str(file)!r} is a Git LFS pointer; run `git lfs pull` in its repository."
+    why = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
+    return why if os.path.isdir(folder) else f"{why} Pass a folder, or a repository id."

@@ -1,4 +1,4 @@
-"""Folders of models that are filled and lose nothing: each file takes its place by a rename when all are written."""
+"""Saving of models into folders without loss: each file takes its place by a rename after all are written."""
 
 import errno
 import functools
@@ -21,7 +21,7 @@ from unitouch_gen.files import (
     files_below,
     finish_save,
     locked,
-    share_as_usual,
+    set_permissions,
     write_file,
     writing_to,
 )
@@ -47,7 +47,7 @@ SAVING_OPTIONS = (
     "use_flashpack",
     "variant",
 )
-"""Options of `save_pretrained` and `push_to_hub` of diffusers and transformers, which ignore others."""
+"""Options of `save_pretrained` and `push_to_hub` of diffusers and transformers, which ignore unknown ones."""
 
 SHARD_NUMBER = re.compile(r"-\d+-of-\d+(?=\.safetensors$)")
 
@@ -56,12 +56,12 @@ SHARD_NUMBER = re.compile(r"-\d+-of-\d+(?=\.safetensors$)")
 def filling(name: str, folder: Path) -> Iterator[Path]:
     """An empty folder to write to, whose files take their places in `folder` when the block ends without an error.
 
-    Everything else in `folder` stays as it is, but for older weights of the components that were written (another
-    number of shards). Files take their places one by one, weights first and configs last. If that is cut off, whoever
-    reads the folder next, by `reading`, finishes it.
+    Other files in `folder` are unchanged, except for older weights of the same components (another number of shards),
+    which are removed. Files take their places one by one, weights first and configs last. If that is cut off, the next
+    reader of the folder finishes it, see `reading`.
 
     Raises:
-        InvalidInputError: If `folder` cannot be written to; what was there stays.
+        InvalidInputError: If `folder` cannot be written to. It is then unchanged.
     """
     target = Path(os.path.realpath(folder))
     with writing_to(name, target):
@@ -76,7 +76,7 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             if is_new:
-                with suppress(OSError):  # of a folder that somebody else has filled meanwhile
+                with suppress(OSError):  # raised if another process has filled the folder
                     target.rmdir()
             raise
     try:
@@ -89,9 +89,9 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
 
 
 def _decide(staging: Path, target: Path) -> None:
-    """Moves staged files beside their destinations, under hidden names, and writes down where they go.
+    """Moves staged files beside their destinations, under hidden names, and writes the plan of their moves.
 
-    Only a move within one folder is sure to be a rename: folders inside `target` may be mounts or links.
+    Only a move within one folder is certainly a rename, since folders inside of `target` may be mounts or links.
     """
     moves: dict[Path, Path] = {}
     new_folders: list[Path] = []
@@ -100,34 +100,34 @@ def _decide(staging: Path, target: Path) -> None:
             destination = target / staged.relative_to(staging)
             check_replaceable(destination)
             _make_folders(destination.parent, new_folders)
-            beside = destination.with_name(f".{destination.name}{staging.name}")
-            if os.path.lexists(beside):
+            hidden = destination.with_name(f".{destination.name}{staging.name}")
+            if os.path.lexists(hidden):
                 why = f"{destination.parent.name} is a link to another component's folder"
                 raise FileExistsError(errno.EEXIST, why)
-            moves[beside] = destination
-            share_as_usual(staged, destination)
-            shutil.move(staged, beside)
+            moves[hidden] = destination
+            set_permissions(staged, destination)
+            shutil.move(staged, hidden)
         _write_plan(moves, target)
     except BaseException:
-        for beside in moves:
-            beside.unlink(missing_ok=True)
+        for hidden in moves:
+            hidden.unlink(missing_ok=True)
         for folder in reversed(new_folders):
-            with suppress(OSError):  # of a folder that another save has filled meanwhile
+            with suppress(OSError):  # raised if another save has filled the folder
                 folder.rmdir()
         raise
 
 
-def _make_folders(folder: Path, made: list[Path]) -> None:
-    """Makes a folder and those above it that are not there, and adds them to `made`."""
-    missing = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
-    for one in reversed(missing):
-        one.mkdir()
-        made.append(one)
+def _make_folders(folder: Path, new_folders: list[Path]) -> None:
+    """Makes a folder and its missing parents, and adds them to `new_folders`."""
+    missing = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    for path in reversed(missing):
+        path.mkdir()
+        new_folders.append(path)
     folder.mkdir(exist_ok=True)  # raises if a file is there
 
 
 def _write_plan(moves: dict[Path, Path], target: Path) -> None:
-    """Writes down which files take which places, and which older weights go; from then on the save is decided."""
+    """Writes the plan: the moves, and older weights to remove. From then on, the save will be finished."""
     ordered = sorted(moves.items(), key=lambda move: _order(move[1]))
     plan = {
         "moves": [[str(path.relative_to(target)) for path in move] for move in ordered],
@@ -137,17 +137,17 @@ def _write_plan(moves: dict[Path, Path], target: Path) -> None:
 
 
 def _order(destination: Path) -> tuple[bool, int, Path]:
-    """A key to sort files by: weights before what describes them, and what lies deeper before what names it."""
+    """A key to sort files by: weights before JSON files, and deeper files before those above them."""
     return destination.suffix == ".json", -len(destination.parts), destination
 
 
 def _earlier_weights(written: Sequence[Path]) -> set[Path]:
-    """Weights of the same components and variants under other names: a single file, or an index and its shards."""
+    """Older weights of the same components and variants: a single file, or an index and its shards."""
     earlier = set[Path]()
     for file in written:
         if file.suffix != ".safetensors":
             continue
-        single = SHARD_NUMBER.sub("", file.name)  # model.fp16-00001-of-00002.safetensors: model.fp16.safetensors
+        single = SHARD_NUMBER.sub("", file.name)  # model.fp16-00001-of-00002.safetensors -> model.fp16.safetensors
         component, *variant = single.removesuffix(".safetensors").split(".", 1)
         index = file.with_name(".".join([component, "safetensors", "index", *variant, "json"]))
         shards = [shard for shard in _shards_in(index) if SHARD_NUMBER.sub("", shard) == single]
@@ -156,7 +156,7 @@ def _earlier_weights(written: Sequence[Path]) -> set[Path]:
 
 
 def _shards_in(index: Path) -> set[str]:
-    """Names of the files that an index of sharded weights lists; none where there is no such index."""
+    """Names of the files in an index of sharded weights; none if there is no such index."""
     try:
         return set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
@@ -164,17 +164,18 @@ def _shards_in(index: Path) -> set[str]:
 
 
 def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
-    """A `save_pretrained` whose files take their places when all of them are written; uploads come after that."""
+    """A `save_pretrained` whose files take their places after all of them are written; uploads follow."""
 
-    @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
+    @functools.wraps(save)  # diffusers reads the signature
     def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
         folder = as_path("save_directory", save_directory)
         check_arguments("`save_pretrained`", kwargs, SAVING_OPTIONS)
         repo_id = kwargs.pop("repo_id", None)
-        with filling("save_directory", folder) as place:
-            save(self, place, *args, **kwargs)
+        with filling("save_directory", folder) as staging:
+            save(self, staging, *args, **kwargs)
         if push_to_hub:
-            given = {name: kwargs[name] for name in kwargs.keys() & inspect.signature(self.push_to_hub).parameters}
-            self.push_to_hub(repo_id or folder.resolve().name, **given)
+            parameters = inspect.signature(self.push_to_hub).parameters
+            upload_options = {name: value for name, value in kwargs.items() if name in parameters}
+            self.push_to_hub(repo_id or folder.resolve().name, **upload_options)
 
     return save_pretrained

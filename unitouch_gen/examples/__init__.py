@@ -1,4 +1,4 @@
-"""Touches, photos and sounds of objects that the built-in models never saw, and a height map, to try calls with.
+"""Example inputs: touches, photos and sounds of objects that the built-in models were not trained on, and a height map.
 
 Those of rock, metal, concrete and sand are of scanned surfaces.
 
@@ -15,7 +15,7 @@ FOLDERS = {
     "audio": ("sounds", ".wav"),
     "height": ("heights", ".png"),
 }
-"""Where the files of each modality are, and their suffix."""
+"""Folder and suffix of the files of each modality."""
 
 
 def examples(modality: str = "touch") -> dict[str, Path]:
@@ -32,23 +32,26 @@ def examples(modality: str = "touch") -> dict[str, Path]:
 
 
 def example(name: str, modality: str = "touch") -> Path:
-    """An input to try a call with.
+    """An example input.
 
     Args:
-        name: What it is of, such as "brick"; a touch also goes by its file's name, "gelsight_brick".
+        name: Of the object, such as "brick"; for a touch also of the file, "gelsight_brick".
         modality: "touch", "image", "audio" or "height", a map to press.
 
     Returns:
         The path of a file.
 
     Raises:
-        InvalidInputError: If there is none of that name; the message lists those there are.
+        InvalidInputError: If there is none of that name; the message lists all names.
 
     Example:
         >>> example("brick").name
         'gelsight_brick.png'
     """
-    known = examples(modality)
+    by_stem = examples(modality)
     check_kind("name", name, str)
-    known = {**{stem.rpartition("_")[2]: file for stem, file in known.items() if modality == "touch"}, **known}
-    return known[check_choice("name", name, known)]
+    by_object: dict[str, Path] = {}
+    if modality == "touch":
+        by_object = {stem.rpartition("_")[2]: file for stem, file in by_stem.items()}
+    by_name = by_object | by_stem
+    return by_name[check_choice("name", name, by_name)]

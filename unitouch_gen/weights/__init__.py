@@ -1,12 +1,16 @@
-"""The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
+"""Folders of the built-in tiny family, from which `unitouch_gen.tiny` builds pipelines.
 
-Layout: `joint/` is the space of all four modalities with its processor; `embedding-bank/` holds image embeddings that
-stylisation and x-to-touch move others towards; `image-vae/` is the autoencoder of pictures, `touch-vae/` that of touch
-images; `touch-to-image/`, `x-to-touch/` and `touch-to-text/` are what only these pipelines have, and their `turbo/` the
-LoRA weights of `-turbo` ones; `stylization/` holds only defaults, as its networks are those of `touch-to-image/`.
-`picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of
-model cards, and `family.json` holds figures, what the cards say, seeds, times and recipes. Every tensor is stored once,
-in fp16.
+    joint/                     the space of all four modalities, with its processor
+    embedding-bank/            image embeddings that stylisation and x-to-touch move others towards
+    image-vae/  touch-vae/     the autoencoders of pictures and of touch images
+    touch-to-image/  x-to-touch/  touch-to-text/      components that only these pipelines have
+        turbo/                 LoRA weights of the `-turbo` pipelines
+    stylization/               defaults; its networks are those of touch-to-image/
+    picture-classifier/  touch-classifier/            classifiers of the materials in generated images
+    cards/                     pictures of model cards
+    family.json                figures, texts of the cards, seeds, times and recipes
+
+Every tensor is stored once, in fp16.
 """
 
 from pathlib import Path
@@ -16,7 +20,9 @@ JOINT = FAMILY / "joint"
 EMBEDDING_BANK = FAMILY / "embedding-bank"
 IMAGE_VAE = FAMILY / "image-vae"
 TOUCH_VAE = FAMILY / "touch-vae"
-TOUCH_TO_IMAGE, X_TO_TOUCH, TOUCH_TO_TEXT = (FAMILY / of for of in ("touch-to-image", "x-to-touch", "touch-to-text"))
+TOUCH_TO_IMAGE = FAMILY / "touch-to-image"
+X_TO_TOUCH = FAMILY / "x-to-touch"
+TOUCH_TO_TEXT = FAMILY / "touch-to-text"
 PICTURE_CLASSIFIER = FAMILY / "picture-classifier"
 TOUCH_CLASSIFIER = FAMILY / "touch-classifier"
 FIGURES = FAMILY / "family.json"
