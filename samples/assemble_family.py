@@ -1,4 +1,4 @@
-"""Puts the outputs of all stages of training together into one family of weights, in fp16, as `tiny(family=)` takes it.
+"""Assembles the outputs of all stages of training into one family of weights, in fp16, for `tiny(family=)`.
 
 python samples/assemble_family.py runs my-family
 """
@@ -19,17 +19,17 @@ from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.stages import STAGES, weights_of
 from unitouch_gen.training.touch_llm import PROMPT
 
-# What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
-# than the picture's own embedding does: noise on the embedding tells the UNet so.
+# Defaults of the tiny pipelines, chosen on the validation split. A touch determines a picture less than the picture's
+# own embedding does, so noise is added to the embedding.
 TOUCH_TO_IMAGE = {
     "default_strength": 1.0,
     "default_guidance_scale": 4.0,
     "default_num_inference_steps": 10,
     "default_noise_level": 150,
 }
-STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best beside the embedding bank
+STYLIZATION = {**TOUCH_TO_IMAGE, "default_noise_level": 250}  # best with the embedding bank
 X_TO_TOUCH = {"default_guidance_scale": 4.0, "default_num_inference_steps": 20}
-# These do best in those numbers of steps. Noise that is added between steps brings touches' variety back.
+# The best schedulers for those numbers of steps. Noise between steps makes touches more varied.
 SCHEDULERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "touch-to-image": (DEISMultistepScheduler, {"use_karras_sigmas": True}),
     "x-to-touch": (EulerAncestralDiscreteScheduler, {}),
@@ -43,14 +43,14 @@ PLACES = {
     "touch_ldm": "x-to-touch",
     "touch_llm": "touch-to-text",
 }
-"""Folders of a family, by the stages whose models they hold."""
+"""Folders of a family for the models of the stages."""
 
 
 def halve(folder: Path) -> None:
-    """Turns all weights below a folder into fp16; integer and boolean tensors stay as they are."""
+    """Converts all weights below a folder to fp16; integer and boolean tensors are kept."""
     for file in folder.rglob("*.safetensors"):
-        tensors = load_file(file).items()  # mapped into memory: what stays is copied before its file is replaced
-        state = {key: value.half() if value.is_floating_point() else value.clone() for key, value in tensors}
+        tensors = load_file(file)  # mapped into memory, so kept tensors are copied before the file is replaced
+        state = {key: value.half() if value.is_floating_point() else value.clone() for key, value in tensors.items()}
         save_file(state, file, metadata={"format": "pt"})
     for file in folder.rglob("config.json"):
         settings = {key: value for key, value in json.loads(file.read_text()).items() if key != "_name_or_path"}
@@ -62,13 +62,13 @@ def write_json(content: dict[str, Any], file: Path) -> None:
 
 
 def command_of(stage: str, runs: Path) -> str:
-    """What runs a stage, with all outputs in one folder."""
+    """The command that runs a stage, with all outputs in one folder."""
     needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[stage].items()]
     return " ".join([f"python -m unitouch_gen.training {stage}", *needs, f"--output {runs / stage}"])
 
 
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:
-    """The record of each stage; refuses if one has not run, or was built on other weights than those before it hold."""
+    """The record of each stage; raises if one has not run, or was built on other weights than are there now."""
     records = {}
     for stage, needs in STAGES.items():
         file = runs / stage / "record.json"
@@ -84,19 +84,19 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
 
 def assemble(
     runs: Annotated[Path, typer.Argument(help="Folder of the stages' outputs.")],
-    output: Annotated[Path, typer.Argument(help="Folder of the family; what else it holds stays.")],
+    output: Annotated[Path, typer.Argument(help="Folder of the family; other files in it are kept.")],
 ) -> None:
-    """Writes a family of what all stages left; nothing of an earlier one is replaced before all of it is written.
+    """Writes a family from the outputs of all stages. An earlier family is replaced after all of it is written.
 
-    Its `family.json` holds the stages' records and no figures: those an earlier one held were of other weights.
+    Its `family.json` has the stages' records and no figures, since earlier figures were of other weights.
     """
     records = read_records(runs)
-    with filling("output", output) as place:
+    with filling("output", output) as folder:
         for stage, name in PLACES.items():
-            shutil.copytree(runs / stage / "model", place / name)
-        (place / "x-to-touch" / "embedding_bank").rename(place / "embedding-bank")
-        (place / "stylization").mkdir()
-        sensors = place / "x-to-touch" / "sensors.json"
+            shutil.copytree(runs / stage / "model", folder / name)
+        (folder / "x-to-touch" / "embedding_bank").rename(folder / "embedding-bank")
+        (folder / "stylization").mkdir()
+        sensors = folder / "x-to-touch" / "sensors.json"
         defaults = {
             "touch-to-image": TOUCH_TO_IMAGE,
             "stylization": STYLIZATION,
@@ -105,13 +105,13 @@ def assemble(
         }
         sensors.unlink()
         for name, settings in defaults.items():
-            write_json(settings, place / name / "defaults.json")
+            write_json(settings, folder / name / "defaults.json")
         for name, (kind, options) in SCHEDULERS.items():
-            config = DDPMScheduler.from_pretrained(place / name / "scheduler").config
+            config = DDPMScheduler.from_pretrained(folder / name / "scheduler").config
             scheduler = kind(**{key: config[key] for key in TRAINED}, **options)
-            scheduler.save_pretrained(place / name / "scheduler")
-        halve(place)
-        write_json({"training": records, "figures": {}}, place / "family.json")
+            scheduler.save_pretrained(folder / name / "scheduler")
+        halve(folder)
+        write_json({"training": records, "figures": {}}, folder / "family.json")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Builds `unitouch_gen/world/collection`: scanned surfaces and recorded sounds that the built-in world is trained on.
+"""Builds `unitouch_gen/world/collection`: the scanned surfaces and recorded sounds of the built-in world.
 
 python samples/build_collection.py --source path/to/raw
 
 The source holds folders `surfaces`, `textures` and `sounds_cc0`, each with an `index.csv` that names the files, their
-source, author and licence. What comes out is resampled and compressed, and its `index.csv` has a row for each surface
+source, author and licence. The collection is resampled and compressed, and its `index.csv` has a row for each surface
 and sound. The same source gives the same collection.
 """
 
@@ -27,11 +27,11 @@ from unitouch_gen.world.scans import COLLECTION, COLOURS, HEIGHT_RANGE, HEIGHTS
 
 COLOUR_SIDE = 256  # pixels
 HEIGHT_SIDE = 384  # pixels
-KEPT_CORRELATION = 0.99  # between a height map and its compressed file
-LEFT_OUT = ("3dtextures",)  # sources whose licence is stated by their site alone
-FINE_STEPS = 0.2  # share of its range that an 8-bit height map has to use; below it, steps would be felt
-COMPUTED = ("uebergame", "nobiax", "vpython")  # their heights were computed from the brightness of a photograph
-HEARD = 0.6  # s of each sound that are kept
+KEPT_CORRELATION = 0.99  # least correlation of a height map and its compressed file
+LEFT_OUT = ("3dtextures",)  # sources whose licence is stated only on their site
+FINE_STEPS = 0.2  # share of its range that an 8-bit height map has to use; below it, steps could be felt
+COMPUTED = ("uebergame", "nobiax", "vpython")  # sources whose heights were computed from the brightness of photographs
+HEARD = 0.6  # length of each sound that is kept, s
 SAMPLE_RATE = 16_000
 
 FIELDS = ["name", "kind", "material", "heights", "split", "group", "source", "author", "licence"]
@@ -39,7 +39,7 @@ FIELDS = ["name", "kind", "material", "heights", "split", "group", "source", "au
 
 @dataclass
 class Surface:
-    """A raw surface: its files, and what is known of it."""
+    """A raw surface: its files, origin and licence."""
 
     name: str
     material: str
@@ -65,13 +65,16 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 
 def surfaces_of(folder: Path) -> list[Surface]:
-    """Those of the folder `surfaces`, whose heights are given as maps already."""
-    found = []
+    """The surfaces of the folder `surfaces`, which has height maps."""
+    surfaces = []
     for row in rows_of(folder / "index.csv"):
         provider = row["source_folder"]
-        height = folder / row["height"] if row["height"] else None
-        computed = provider in COMPUTED
-        found.append(
+        height = None
+        heights = "none"
+        if row["height"]:
+            height = folder / row["height"]
+            heights = "computed" if provider in COMPUTED else "measured"
+        surfaces.append(
             Surface(
                 name=row["surface"],
                 material=row["material"].replace("_", " "),
@@ -81,27 +84,26 @@ def surfaces_of(folder: Path) -> list[Surface]:
                 licence=row["licence"],
                 albedo=folder / row["albedo"],
                 height=height,
-                heights="none" if height is None else "computed" if computed else "measured",
+                heights=heights,
             )
         )
-    return found
+    return surfaces
 
 
 def textures_of(folder: Path) -> list[Surface]:
-    """Those of the folder `textures`, a row for each of their maps; of some there are normals alone."""
+    """The surfaces of the folder `textures`, which has a row for each of their maps; some have only normals."""
     maps = defaultdict[tuple[str, str], dict[str, dict[str, str]]](dict)
     for row in rows_of(folder / "index.csv"):
         maps[row["class"], row["item"]][row["kind"]] = row
-    found = []
+    surfaces = []
     for (material, name), kinds in maps.items():
         albedo = kinds["albedo"]
         licence = albedo["licence"]
-        known = [site for site in ("ambientCG", "Poly Haven", "cgbookcase", "3dtextures") if site in licence]
-        provider = "ambientCG" if "cc0textures.com" in licence else known[0] if known else albedo["source"]
+        provider = provider_of(licence) or albedo["source"]
         height = kinds.get("height")
         if height and "normal" in kinds and too_coarse(height["note"]):
             height = None
-        found.append(
+        surfaces.append(
             Surface(
                 name=name,
                 material={"sand/soil": "sand"}.get(material, material),
@@ -115,37 +117,51 @@ def textures_of(folder: Path) -> list[Surface]:
                 heights="measured",
             )
         )
-    return found
+    return surfaces
+
+
+def provider_of(licence: str) -> str | None:
+    """The site that a licence names, if it is one of the known sites."""
+    if "cc0textures.com" in licence:
+        return "ambientCG"
+    for site in ("ambientCG", "Poly Haven", "cgbookcase", "3dtextures"):
+        if site in licence:
+            return site
+    return None
 
 
 def too_coarse(note: str) -> bool:
-    """Whether a height map of 8 bits uses few of its levels, by its note: "height range 0.021 of full, 8-bit"."""
-    said = re.search(r"range ([\d.]+) of full, 8-bit", note)
-    return bool(said) and float(said[1]) < FINE_STEPS
+    """Whether an 8-bit height map uses few of its levels, by its note: "height range 0.021 of full, 8-bit"."""
+    match = re.search(r"range ([\d.]+) of full, 8-bit", note)
+    return match is not None and float(match[1]) < FINE_STEPS
 
 
 # Heights --------------------------------------------------------------------------------------------------------------
 
 
 def heights_of(surface: Surface) -> np.ndarray:
-    """Heights in units of their deviation, without a plane, at most `HEIGHT_RANGE`, (S, S)."""
+    """Heights in units of their deviation, without their plane, at most `HEIGHT_RANGE`, (S, S)."""
     if surface.height is not None:
         values = np.asarray(Image.open(surface.height), dtype=np.float32)
     else:
-        values = integrated(np.asarray(Image.open(surface.normal).convert("RGB"), dtype=np.float32) / 127.5 - 1.0)
-    values = values[..., 0] if values.ndim == 3 else values
+        pixels = np.asarray(Image.open(surface.normal).convert("RGB"), dtype=np.float32)
+        values = integrated(pixels / 127.5 - 1.0)
+    if values.ndim == 3:
+        values = values[..., 0]
     values = np.asarray(Image.fromarray(values).resize((HEIGHT_SIDE, HEIGHT_SIDE), Image.Resampling.LANCZOS))
     axis = np.linspace(-1.0, 1.0, HEIGHT_SIDE)
-    plane = np.stack(np.broadcast_arrays(np.ones((1, 1)), axis[None, :], axis[:, None]), axis=-1).reshape(-1, 3)
-    values = values - (plane @ np.linalg.lstsq(plane, values.reshape(-1), rcond=None)[0]).reshape(values.shape)
+    columns = np.broadcast_arrays(np.ones((1, 1)), axis[None, :], axis[:, None])
+    plane = np.stack(columns, axis=-1).reshape(-1, 3)
+    coefficients, *_ = np.linalg.lstsq(plane, values.reshape(-1), rcond=None)
+    values = values - (plane @ coefficients).reshape(values.shape)
     return (values / values.std().clip(1e-9)).clip(-HEIGHT_RANGE, HEIGHT_RANGE)
 
 
 def integrated(normals: np.ndarray) -> np.ndarray:
-    """Heights of a map of normals (S, S, 3), by Frankot and Chellappa (1988).
+    """Heights from a map of normals (S, S, 3), by Frankot and Chellappa (1988).
 
-    Green points up in some maps and down in others. The true direction is that of the smaller curl: slopes of a surface
-    have none.
+    Green points up in some maps and down in others. The direction with the smaller curl is taken, since slopes of a
+    surface have none.
     """
     slope_x = -normals[..., 0] / normals[..., 2].clip(0.2)
     slope_y = normals[..., 1] / normals[..., 2].clip(0.2)
@@ -153,8 +169,11 @@ def integrated(normals: np.ndarray) -> np.ndarray:
     wave_x = 2j * np.pi * np.fft.fftfreq(slope_x.shape[1])[None, :]
     along_x = np.fft.fft2(slope_x)
     along_y = np.fft.fft2(slope_y)
-    curls = [np.abs(wave_x * sign * along_y - wave_y * along_x).sum() for sign in (1.0, -1.0)]
-    sign = (1.0, -1.0)[int(np.argmin(curls))]
+
+    def curl(sign: float) -> float:
+        return np.abs(wave_x * sign * along_y - wave_y * along_x).sum()
+
+    sign = min((1.0, -1.0), key=curl)
     power = np.abs(wave_x) ** 2 + np.abs(wave_y) ** 2
     power[0, 0] = 1.0
     spectrum = (np.conj(wave_x) * along_x + np.conj(wave_y) * sign * along_y) / power
@@ -166,14 +185,14 @@ def integrated(normals: np.ndarray) -> np.ndarray:
 
 
 def stem_of(name: str) -> str:
-    """A name without separators, leading zeros and the letter that names a variant: bricks075 for bricks_75b."""
+    """A name without separators, leading zeros and the letter of a variant: bricks75 for bricks_075b."""
     letters = re.sub(r"[^a-z0-9]", "", name.lower())
     letters = re.sub(r"(?<=\d)[a-d]$", "", letters)
     return re.sub(r"0+(?=\d)", "", letters)
 
 
 def same_texture(pictures: Sequence[Image.Image], least: float = 0.7) -> list[tuple[int, int]]:
-    """Pairs of pictures that show one texture: of a correlation of at least `least` at some shift, in grey at 64 px."""
+    """Pairs of pictures of one texture: those with a correlation of `least` or more at some shift, in grey at 64 px."""
     grey = np.stack([np.asarray(picture.convert("L").resize((64, 64)), dtype=np.float32) for picture in pictures])
     grey = grey - grey.mean(axis=(1, 2), keepdims=True)
     grey = grey / np.linalg.norm(grey, axis=(1, 2), keepdims=True).clip(1e-6)
@@ -186,7 +205,7 @@ def same_texture(pictures: Sequence[Image.Image], least: float = 0.7) -> list[tu
 
 
 def grouped(surfaces: list[Surface]) -> None:
-    """Names the group of each surface: those with one stem, or with one picture, are twins."""
+    """Sets the group of each surface; surfaces with the same stem or the same texture are in one group."""
     parent = list(range(len(surfaces)))
 
     def root(row: int) -> int:
@@ -199,28 +218,29 @@ def grouped(surfaces: list[Surface]) -> None:
         stems[stem_of(surface.name)].append(row)
     pairs = [(rows[0], row) for rows in stems.values() for row in rows[1:]]
     pairs += same_texture([surface.colours for surface in surfaces])
-    for one, other in pairs:
-        parent[max(root(one), root(other))] = min(root(one), root(other))
+    for row, twin in pairs:
+        roots = sorted([root(row), root(twin)])
+        parent[roots[1]] = roots[0]
     for row, surface in enumerate(surfaces):
         surface.group = surfaces[root(row)].name
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Names in an order that has nothing to do with them, and is the same every time."""
+    """Names in a pseudo-random order that is the same every time."""
     return sorted(names, key=lambda name: hashlib.sha256(name.encode()).digest())
 
 
 def splits_of(surfaces: list[Surface]) -> dict[str, str]:
-    """The split of each group: a fifth of each material, one to four, are for testing and one for validation.
+    """The split of each group: of each material a fifth, one to four, for testing, and one for validation.
 
-    What is held out has measured heights, where a material has enough of them.
+    Held-out groups have measured heights, if a material has enough of them.
     """
     splits = {surface.group: "train" for surface in surfaces}
     for material in sorted({surface.material for surface in surfaces}):
-        own = [one for one in surfaces if one.material == material and one.relief is not None]
-        groups = in_order({one.group for one in own})
+        own = [surface for surface in surfaces if surface.material == material and surface.relief is not None]
+        groups = in_order({surface.group for surface in own})
         free = [group for group in groups if splits[group] == "train"]
-        measured = {one.group for one in own if one.heights == "measured"}
+        measured = {surface.group for surface in own if surface.heights == "measured"}
         candidates = [group for group in free if group in measured] or free
         count = min(max(round(len(groups) / 5), 1), 4)
         for group in candidates[:count]:
@@ -240,12 +260,12 @@ def compressed(image: Image.Image, quality: int) -> bytes:
 
 
 def compressed_height(relief: np.ndarray) -> bytes:
-    """The smallest file whose heights still correlate with these."""
+    """The smallest file whose heights have a correlation of `KEPT_CORRELATION` with `relief`."""
     levels = np.round((relief / HEIGHT_RANGE + 1.0) * 127.5).astype(np.uint8)
     for quality in (40, 50, 60, 70, 80, 90, 97):
         content = compressed(Image.fromarray(levels), quality)
-        again = np.asarray(Image.open(io.BytesIO(content)).convert("L"), dtype=np.float32)
-        if np.corrcoef(again.ravel(), relief.ravel())[0, 1] >= KEPT_CORRELATION:
+        decoded = np.asarray(Image.open(io.BytesIO(content)).convert("L"), dtype=np.float32)
+        if np.corrcoef(decoded.ravel(), relief.ravel())[0, 1] >= KEPT_CORRELATION:
             break
     return content
 
@@ -255,8 +275,9 @@ def write_surfaces(surfaces: list[Surface], place: Path) -> list[dict[str, str]]
     splits = splits_of(surfaces)
     rows = []
     for surface in tqdm(surfaces, "surfaces"):
-        name = f"{surface.material.replace(' ', '_')}__{surface.provider.split('/')[0].lower()}_{surface.name}"
-        name = re.sub(r"[^a-z0-9_]+", "_", name.lower())
+        material = surface.material.replace(" ", "_")
+        provider = surface.provider.split("/")[0]
+        name = re.sub(r"[^a-z0-9_]+", "_", f"{material}__{provider}_{surface.name}".lower())
         (place / f"{name}{COLOURS}").write_bytes(compressed(surface.colours, 80))
         if surface.relief is not None:
             (place / f"{name}{HEIGHTS}").write_bytes(compressed_height(surface.relief))
@@ -278,14 +299,14 @@ def write_surfaces(surfaces: list[Surface], place: Path) -> list[dict[str, str]]
 
 
 def sound_kind(name: str) -> str:
-    """What is struck, without the number of the take."""
+    """The kind of hit, a name without the number of the take."""
     return re.sub(r"[._]\d+$", "", name)
 
 
 def write_sounds(folder: Path, place: Path) -> list[dict[str, str]]:
-    """Sounds at 16 kHz from where they begin; several takes of one kind of hit are on one side of the split.
+    """Writes sounds at 16 kHz from their onset; all takes of one kind of hit are in one split.
 
-    A material with two kinds keeps one to test by; with four, another one to choose by.
+    Of a material with two kinds or more, one is for testing; with four or more, another one is for validation.
     """
     place.mkdir(parents=True, exist_ok=True)
     raw = rows_of(folder / "index.csv")
@@ -326,8 +347,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=COLLECTION)
     arguments = parser.parse_args()
 
-    found = [*surfaces_of(arguments.source / "surfaces"), *textures_of(arguments.source / "textures")]
-    surfaces = [surface for surface in found if not any(name in surface.provider for name in LEFT_OUT)]
+    raw = [*surfaces_of(arguments.source / "surfaces"), *textures_of(arguments.source / "textures")]
+    surfaces = [surface for surface in raw if not any(name in surface.provider for name in LEFT_OUT)]
     for surface in tqdm(surfaces, "reading"):
         picture = Image.open(surface.albedo).convert("RGB")
         surface.colours = picture.resize((COLOUR_SIDE, COLOUR_SIDE), Image.Resampling.LANCZOS)

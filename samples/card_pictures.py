@@ -1,4 +1,4 @@
-"""Draws what the model card of a built-in pipeline shows: inputs above, and what is generated from them below.
+"""Draws the picture of a built-in pipeline's model card: inputs above, and generated images below.
 
 python samples/card_pictures.py --pipeline stylization
 for name in touch-to-image stylization x-to-touch; do    # the cards' own
@@ -33,16 +33,15 @@ def main() -> None:
         names["touch"] = ["wood", "tile", "rock", "metal"]  # one for each photo
     else:
         del names["touch" if arguments.pipeline.startswith("x-to-touch") else "image"]
-    inputs = {modality: [example(name, modality) for name in of] for modality, of in names.items()}
+    inputs = {}
+    for modality, examples_of_it in names.items():
+        inputs[modality] = [example(name, modality) for name in examples_of_it]
     titles = [" + ".join(column).replace("_", " ") for column in zip(*names.values(), strict=True)]
     generators = [torch.Generator().manual_seed(arguments.seed + number) for number in range(len(titles))]
     generated = unitouch_gen.tiny(arguments.pipeline)(**inputs, generator=generators).images
-    grid = draw_grid(
-        [*([Image.open(file) for file in files] for files in inputs.values()), generated],
-        labels=[*(LABELS[modality] for modality in inputs), "generated"],
-        titles=titles,
-        size=16,
-    )
+    rows = [[Image.open(file) for file in files] for files in inputs.values()]
+    labels = [LABELS[modality] for modality in inputs]
+    grid = draw_grid([*rows, generated], labels=[*labels, "generated"], titles=titles, size=16)
     save(grid, arguments.output)
 
 

@@ -1,4 +1,4 @@
-"""Touches of sensors that nobody told of, above the heights that are read off them.
+"""Draws touches above the heights that are estimated from them, without knowing their sensors.
 
 python samples/reliefs.py --output outputs/reliefs.png
 """

@@ -1,4 +1,4 @@
-"""Renders `samples/inputs/`, what `unitouch_gen.example` has: of objects of the built-in world that no training saw.
+"""Renders `samples/inputs/`, the inputs of `unitouch_gen.example`, of held-out objects of the built-in world.
 
 python samples/render_inputs.py
 """
@@ -17,7 +17,7 @@ INPUTS = Path(__file__).parent / "inputs"
 WORLD = World()
 SCANS = World(scanned=1.0)
 
-# (sensor, material, which of its held-out objects): one of each sensor at least, and two of sensors that nobody knows.
+# (sensor, material, number of the held-out object): at least one of each sensor, and two of unknown sensors.
 TOUCHES = (
     ("gelsight", "brick", 0),
     ("gelsight", "tile", 0),
@@ -41,12 +41,12 @@ def to_picture(pixels) -> Image.Image:
     return Image.fromarray((pixels.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
-def contact(material: str, which: int, modality: str, sensor: str = "gelsight", world: World = WORLD) -> Scene:
+def contact(material: str, number: int, modality: str, sensor: str = "gelsight", world: World = WORLD) -> Scene:
     """One modality of one contact with a held-out object."""
     row = MATERIAL_NAMES.index(material)
-    name = ([part[row]] for part in flat_contacts(world, which))
-    known = SENSORS[sensor] if sensor in SENSORS else draw_sensor(0, int(sensor.removeprefix("drawn_")))
-    return world.render(*name, modalities=(modality,), sensors=(known,))
+    materials, objects, contacts = flat_contacts(world, number)
+    model = SENSORS[sensor] if sensor in SENSORS else draw_sensor(0, int(sensor.removeprefix("drawn_")))
+    return world.render([materials[row]], [objects[row]], [contacts[row]], modalities=(modality,), sensors=(model,))
 
 
 def coin(side: int = 256) -> Image.Image:
@@ -56,7 +56,8 @@ def coin(side: int = 256) -> Image.Image:
     draw.circle((side / 2, side / 2), 0.46 * side, fill=0.55)
     draw.circle((side / 2, side / 2), 0.46 * side, outline=1.0, width=side // 22)
     for turn in range(0, 360, 10):
-        x, y = (side / 2 + 0.365 * side * part(np.radians(turn)) for part in (np.cos, np.sin))
+        x = side / 2 + 0.365 * side * np.cos(np.radians(turn))
+        y = side / 2 + 0.365 * side * np.sin(np.radians(turn))
         draw.circle((x, y), 0.012 * side, fill=0.85)
     font = ImageFont.load_default(0.17 * side)
     for text, place in (("UNI", 0.4), ("TOUCH", 0.58)):
@@ -70,23 +71,24 @@ def main() -> None:
     coin().save(INPUTS / "heights" / "coin.png", optimize=True)
     for folder in (INPUTS, INPUTS / "photos", INPUTS / "sounds"):
         folder.mkdir(exist_ok=True)
-    for sensor, material, which in TOUCHES:
-        file = INPUTS / f"{sensor.split('_')[0] if sensor not in SENSORS else sensor}_{material}.png"
-        to_picture(contact(material, which, "touch", sensor).touch[sensor][0]).save(file)
+    for sensor, material, number in TOUCHES:
+        prefix = sensor if sensor in SENSORS else sensor.split("_")[0]
+        file = INPUTS / f"{prefix}_{material}.png"
+        to_picture(contact(material, number, "touch", sensor).touch[sensor][0]).save(file)
         print(file)
-    for sensor, material, which in SCANNED:
+    for sensor, material, number in SCANNED:
         touched = INPUTS / f"{sensor}_{material}.png"
-        to_picture(contact(material, which, "touch", sensor, SCANS).touch[sensor][0]).save(touched)
+        to_picture(contact(material, number, "touch", sensor, SCANS).touch[sensor][0]).save(touched)
         photographed = INPUTS / "photos" / f"{material}.png"
-        to_picture(contact(material, which, "image", world=SCANS).image[0]).save(photographed)
+        to_picture(contact(material, number, "image", world=SCANS).image[0]).save(photographed)
         print(touched, photographed, sep="\n")
-    for material, which in PHOTOS:
+    for material, number in PHOTOS:
         file = INPUTS / "photos" / f"{material.replace(' ', '_')}.png"
-        to_picture(contact(material, which, "image").image[0]).save(file)
+        to_picture(contact(material, number, "image").image[0]).save(file)
         print(file)
-    for material, which in SOUNDS:
+    for material, number in SOUNDS:
         file = INPUTS / "sounds" / f"{material}.wav"
-        soundfile.write(file, contact(material, which, "audio").audio[0].numpy(), SAMPLE_RATE)
+        soundfile.write(file, contact(material, number, "audio").audio[0].numpy(), SAMPLE_RATE)
         print(file)
 
 

@@ -1,4 +1,4 @@
-"""Draws what sounds would feel like, with the waveform beside the touch images.
+"""Draws touch images generated from sounds, with the waveforms beside them.
 
 python samples/sound_to_touch.py samples/inputs/sounds/*.wav
 """
@@ -33,16 +33,14 @@ def main() -> None:
     )
     for row, file in enumerate(arguments.sounds):
         samples, rate = soundfile.read(file, always_2d=True)
-        axes[row, 0].plot([1000 * i / rate for i in range(len(samples))], samples.mean(axis=1), linewidth=0.6)
+        milliseconds = [1000 * sample / rate for sample in range(len(samples))]
+        axes[row, 0].plot(milliseconds, samples.mean(axis=1), linewidth=0.6)
         axes[row, 0].set_title(file.stem, fontsize=8, loc="left", pad=2)
         axes[row, 0].tick_params(labelsize=6)
         axes[row, 0].set_yticks([])
         axes[row, 0].spines[["top", "right", "left"]].set_visible(False)
-        touches = pipe(
-            audio=file,
-            sensor=sensors,
-            generator=torch.Generator().manual_seed(arguments.seed),
-        ).images
+        generator = torch.Generator().manual_seed(arguments.seed)
+        touches = pipe(audio=file, sensor=sensors, generator=generator).images
         for axis, touch, sensor in zip(axes[row, 1:], touches, sensors, strict=True):
             axis.imshow(touch)
             axis.axis("off")

@@ -28,9 +28,9 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/stylization.png"))
     parser.add_argument("--photos", type=Path, nargs="+", default=PHOTOS)
     parser.add_argument("--touches", type=Path, nargs="+", default=TOUCHES)
-    parser.add_argument("--touch-weight", type=float, default=0.7, help="share of the touch")
+    parser.add_argument("--touch-weight", type=float, default=0.7, help="weight of the touch in the mix")
     parser.add_argument(
-        "--layout", type=int, default=14, help="cells along a side of the grid on which the photo is held"
+        "--layout", type=int, default=14, help="cells along a side of the grid that keeps the photo's layout"
     )
     arguments = parser.parse_args()
 
@@ -42,12 +42,17 @@ def main() -> None:
             arguments.touches,
             touch_weight=arguments.touch_weight,
             layout=arguments.layout,
-            # The same noise in every column, so that the touch alone makes the difference.
+            # The same noise in every column, so that only the touch is different.
             generator=[torch.Generator().manual_seed(number) for _ in arguments.touches],
         ).images
         rows.append([Image.open(photo), *pictures])
-    labels, titles = (["", *(file.stem.replace("_", " ") for file in f)] for f in (arguments.photos, arguments.touches))
+    labels = ["", *map(name_of, arguments.photos)]
+    titles = ["", *map(name_of, arguments.touches)]
     save(draw_grid(rows, labels=labels, titles=titles, side=192, size=24), arguments.output)
+
+
+def name_of(file: Path) -> str:
+    return file.stem.replace("_", " ")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws descriptions as every sensor would feel them.
+"""Draws touch images generated from descriptions, for every sensor.
 
 python samples/text_to_touch.py
 python samples/text_to_touch.py "rough brick" "a smooth metal cylinder"
@@ -24,15 +24,10 @@ def main() -> None:
 
     pipe = unitouch_gen.tiny("x-to-touch")
     sensors = pipe.config.sensors
-    rows = [
-        pipe(
-            text=text,
-            sensor=sensors,
-            # The same noise for every sensor.
-            generator=[torch.Generator().manual_seed(arguments.seed) for _ in sensors],
-        ).images
-        for text in arguments.texts
-    ]
+    rows = []
+    for text in arguments.texts:
+        generators = [torch.Generator().manual_seed(arguments.seed) for _ in sensors]  # the same noise for all sensors
+        rows.append(pipe(text=text, sensor=sensors, generator=generators).images)
     save(draw_grid(rows, labels=arguments.texts, titles=sensors, side=192, size=24), arguments.output)
 
 

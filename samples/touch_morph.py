@@ -1,4 +1,4 @@
-"""A slow morph between the pictures of two touches, there and back, as a GIF: the picture between the touches.
+"""Morphs between the pictures of two touches and back, as a GIF with the picture between the touches.
 
 python samples/touch_morph.py
 python samples/touch_morph.py samples/inputs/gelsight_brick.png samples/inputs/digit_wood.png
@@ -31,42 +31,40 @@ def main() -> None:
         parser.error("pass two touches")
 
     pipe = unitouch_gen.tiny("touch-to-image")
-    one, other = pipe.encode_touch(arguments.touches).split(1)
-    # Cosine easing: the ends are rests.
-    shares = (1 - torch.cos(torch.linspace(0, torch.pi, arguments.frames))) / 2
-    embeds = torch.cat([mix_to_norm(torch.stack([one, other]), torch.stack([1 - s, s])) for s in shares])
-    # One noise for all frames, of the embedding as of the latents: what changes is the touch.
+    ends = pipe.encode_touch(arguments.touches)[:, None]  # (2, 1, D)
+    shares = (1 - torch.cos(torch.linspace(0, torch.pi, arguments.frames))) / 2  # cosine easing
+    embeds = torch.cat([mix_to_norm(ends, torch.stack([1 - share, share])) for share in shares])
+    # All frames have the same noise, of the embedding and of the latents, so only the touch changes.
     generators = [torch.Generator().manual_seed(arguments.seed) for _ in embeds]
     pictures = pipe(touch_embeds=embeds, generator=generators).images
-    ends = [(Image.open(file), file.stem.replace("_", " ")) for file in arguments.touches]
-    frames = [frame_of(picture, ends, share.item(), arguments.side) for picture, share in zip(pictures, shares)]
+    touches = [(Image.open(file), file.stem.replace("_", " ")) for file in arguments.touches]
+    frames = [frame_of(picture, touches, share.item(), arguments.side) for picture, share in zip(pictures, shares)]
     frames += frames[-2:0:-1]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     frames[0].save(arguments.output, save_all=True, append_images=frames[1:], duration=90, loop=0)
     print(arguments.output)
 
 
-def frame_of(picture: Image.Image, ends: list[tuple[Image.Image, str]], share: float, side: int) -> Image.Image:
-    """The picture between the two touches with their names, each as faint as its share in it is small."""
+def frame_of(picture: Image.Image, touches: list[tuple[Image.Image, str]], share: float, side: int) -> Image.Image:
+    """The picture between the two touches with their names, each faded by its share in the picture."""
     small = side // 2
-    bar = MARGIN
-    names = [written(name, 18, small) for _, name in ends]
-    canvas = Image.new("RGB", (2 * (MARGIN + small + GAP) + side, MARGIN + side + bar + MARGIN), PAPER)
-    canvas.paste(picture.resize((side, side), Image.Resampling.BICUBIC), (MARGIN + small + GAP, MARGIN))
-    places = (MARGIN, canvas.width - MARGIN - small)
-    for (touch, _), name, x, weight in zip(ends, names, places, (1 - share, share)):
-        shown = Image.new("RGB", (small, small + GAP + name.height), PAPER)
-        shown.paste(to_tile(touch, small), (0, 0))
-        shown.paste(name, ((small - name.width) // 2, small + GAP))
-        faint = Image.blend(Image.new("RGB", shown.size, PAPER), shown, 0.25 + 0.75 * weight)
-        canvas.paste(faint, (x, MARGIN + (side - small) // 2))
-    # Where between the two the picture is.
-    draw = ImageDraw.Draw(canvas)
     left = MARGIN + small + GAP
-    y = MARGIN + side + bar
-    draw.line((left, y, left + side, y), "lightgrey", 2)
-    draw.circle((left + share * side, y), 5, INK)
-    # A palette for each frame, and no dithering: its grain would flicker.
+    bar_y = MARGIN + side + MARGIN
+    canvas = Image.new("RGB", (2 * left + side, bar_y + MARGIN), PAPER)
+    canvas.paste(picture.resize((side, side), Image.Resampling.BICUBIC), (left, MARGIN))
+    places = (MARGIN, canvas.width - MARGIN - small)
+    for (touch, text), x, weight in zip(touches, places, (1 - share, share)):
+        name = written(text, 18, small)
+        panel = Image.new("RGB", (small, small + GAP + name.height), PAPER)
+        panel.paste(to_tile(touch, small), (0, 0))
+        panel.paste(name, ((small - name.width) // 2, small + GAP))
+        faded = Image.blend(Image.new("RGB", panel.size, PAPER), panel, 0.25 + 0.75 * weight)
+        canvas.paste(faded, (x, MARGIN + (side - small) // 2))
+    # A dot on a line marks the position between the touches.
+    draw = ImageDraw.Draw(canvas)
+    draw.line((left, bar_y, left + side, bar_y), "lightgrey", 2)
+    draw.circle((left + share * side, bar_y), 5, INK)
+    # A palette for each frame, without dithering, whose grain would flicker.
     return canvas.quantize(256, kmeans=2, dither=Image.Dither.NONE)
 
 

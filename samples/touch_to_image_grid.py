@@ -18,14 +18,14 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/touch_to_image.png"))
     parser.add_argument("--sensor", default="gelsight", choices=sorted(SENSORS))
-    parser.add_argument("--object", type=int, default=0, help="which of the held-out objects")
+    parser.add_argument("--object", type=int, default=0, help="number of the held-out object")
     parser.add_argument("--pictures", type=int, default=4, help="pictures generated from each touch")
     arguments = parser.parse_args()
 
     world = World(scanned=0.5)
     count = len(MATERIAL_NAMES)
-    names = flat_contacts(world, arguments.object)
-    scene = world.render(*names, modalities=("image", "touch"), sensors=(arguments.sensor,))
+    contacts = flat_contacts(world, arguments.object)
+    scene = world.render(*contacts, modalities=("image", "touch"), sensors=(arguments.sensor,))
     touches = scene.touch[arguments.sensor]
     pipe = unitouch_gen.tiny("touch-to-image")
     pictures = pipe(

@@ -1,10 +1,10 @@
-"""Watches a touch sensor, or a video of one, and makes a picture of every touch; needs PyAV, of the extra `train`.
+"""Generates a picture from every touch of a sensor's camera or video; needs PyAV, of the extra `train`.
 
 python samples/watch.py 0 --output outputs/watched    # the first camera, on Linux; Ctrl-C ends it
 python samples/watch.py press.mp4
 
-Leave the sensor alone for a moment: frames that are alike show the gel at rest. If it is pressed from the beginning,
-the gel is seen when it is let go, as it has less structure than a contact.
+Do not touch the sensor for a moment: similar frames show the gel at rest. If it is pressed from the beginning, the gel
+is recognised when it is released, since it has less structure than a contact.
 """
 
 import argparse
@@ -30,12 +30,12 @@ from unitouch_gen.models.videos import (
     thumbnails,
 )
 
-SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
+SETTLED = 5  # frames without a firmer one, after which a contact is taken to be at its firmest
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A frame, uint8 (H, W, 3), its number, and its mean difference from the gel at rest, of full scale."""
+    """A frame, uint8 (H, W, 3), its number, and its mean difference from the gel at rest, as a share of full scale."""
 
     frame: np.ndarray
     index: int
@@ -52,17 +52,17 @@ def camera(number: str) -> Iterator[np.ndarray]:
 
 
 def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
-    """Contacts of a stream, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
+    """Contacts of a stream, each when it is at its firmest, and again if it becomes firmer by a twentieth.
 
     Frames that are black, green or repeated are left out.
     """
-    rest: Tensor | None = None
+    rest: Tensor | None = None  # thumbnail of the gel at rest
     least = LEAST_CHANGE
-    quiet: list[Tensor] = []  # thumbnails of the latest frames that are alike
+    quiet: list[Tensor] = []  # thumbnails of the latest similar frames
     recent = deque[Contact](maxlen=3)
     best: Contact | None = None
-    due = False  # whether the best is yet to be yielded
-    age = 0  # frames since it was as firm
+    due = False  # whether the best has not been yielded yet
+    age = 0  # frames since the best
     previous: np.ndarray | None = None
     for index, frame in enumerate(frames):
         small = thumbnails(torch.from_numpy(frame.copy()).permute(2, 0, 1)[None])
@@ -76,7 +76,7 @@ def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
                 rest = still
                 noise = change_of(torch.cat(quiet), rest).max().item()
                 least = max(LEAST_CHANGE, 3.0 * noise)
-                best = None  # what was judged by another one
+                best = None  # it was measured against another gel
                 due = False
                 recent.clear()
         repeated = previous is not None and np.array_equal(frame, previous)
@@ -84,19 +84,21 @@ def contacts(frames: Iterable[np.ndarray]) -> Iterator[Contact]:
         if rest is None or repeated:
             continue
         change = change_of(small, rest)
-        let_go = change.max().item() < least
-        if not let_go:
+        is_released = change.max().item() < least
+        if not is_released:
             recent.append(Contact(frame, index, change.mean().item()))
-            middle = sorted(recent, key=lambda one: one.firmness)[len(recent) // 2]  # a broken frame is never it
+            median = sorted(recent, key=lambda contact: contact.firmness)[len(recent) // 2]  # leaves out broken frames
             age += 1
-            if len(recent) == 3 and (best is None or middle.firmness > (1.0 if due else 1.05) * best.firmness):
-                best = middle
+            factor = 1.0 if due else 1.05
+            is_firmer = best is None or median.firmness > factor * best.firmness
+            if len(recent) == 3 and is_firmer:
+                best = median
                 due = True
                 age = 0
-        if due and best is not None and (let_go or age >= SETTLED):
+        if due and best is not None and (is_released or age >= SETTLED):
             yield best
             due = False
-        if let_go:
+        if is_released:
             best = None
             recent.clear()
     if rest is None:
@@ -109,7 +111,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("source", help="index of a camera, or a video file")
     parser.add_argument("--output", type=Path, default=Path("outputs/watched"))
-    parser.add_argument("--sensor", help="its name; found by its looks if left out")
+    parser.add_argument("--sensor", help="its name; retrieved from the images if left out")
     parser.add_argument("--bgr", action="store_true", help="frames have blue in the place of red")
     arguments = parser.parse_args()
 

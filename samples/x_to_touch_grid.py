@@ -1,4 +1,4 @@
-"""Draws one row for each material: a photo, the true touch, and touches imagined from photo, caption and sound.
+"""Draws one row for each material: a photo, the true touch, and touches generated from photo, caption and sound.
 
 Every second material is scanned, as far as there are scans.
 
@@ -22,26 +22,26 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/x_to_touch.png"))
     parser.add_argument("--sensor", default="gelsight", choices=sorted(SENSORS))
-    parser.add_argument("--object", type=int, default=0, help="which of the held-out objects")
+    parser.add_argument("--object", type=int, default=0, help="number of the held-out object")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
     world = World(scanned=0.5)
     count = len(MATERIAL_NAMES)
-    names = flat_contacts(world, arguments.object)
-    scene = world.render(*names, modalities=("image", "touch", "audio", "text"), sensors=(arguments.sensor,))
+    contacts = flat_contacts(world, arguments.object)
+    scene = world.render(*contacts, modalities=("image", "touch", "audio", "text"), sensors=(arguments.sensor,))
     pipe = unitouch_gen.tiny("x-to-touch")
 
-    def imagine(**condition: object) -> torch.Tensor:
+    def generate(**condition: object) -> torch.Tensor:
         generators = [torch.Generator().manual_seed(arguments.seed) for _ in range(count)]
         return pipe(**condition, sensor=arguments.sensor, generator=generators, output_type="pt").images
 
     columns = [
         scene.image,
         scene.touch[arguments.sensor],
-        imagine(image=scene.image),
-        imagine(text=scene.text),
-        imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio]),
+        generate(image=scene.image),
+        generate(text=scene.text),
+        generate(audio=[(sound, SAMPLE_RATE) for sound in scene.audio]),
     ]
     rows = list(zip(*columns, strict=True))
     save(draw_grid(rows, labels=labels_of(scene), titles=TITLES, blocks=2), arguments.output)
