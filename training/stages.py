@@ -160,7 +160,8 @@ class Stage:
         init = self.folders.get("init")
         if init is not None and not (init / "preprocessor_config.json").is_file():
             init = None  # an autoencoder or a UNet
-        if folder := self.folders.get("joint", init):
+        folder = self.folders.get("joint", init)
+        if folder is not None:
             return UniTouchProcessor.from_pretrained(folder)
         return UniTouchProcessor(image_size=self.data.image_size, audio=self.data.audio)  # type: ignore[arg-type]
 

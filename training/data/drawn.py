@@ -100,8 +100,8 @@ class DrawnContacts:
     ) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
         """Scenes of sixteen contacts each, with some modalities, and their pairs of sensors."""
         world = self.world(size, kind)
-        material, object_, contact = (numbers.split(GROUP) for numbers in self.contacts(split))
-        for group, contacts in enumerate(zip(material, object_, contact, strict=True)):
+        groups = zip(*(numbers.split(GROUP) for numbers in self.contacts(split)), strict=True)
+        for group, contacts in enumerate(groups):
             sensors = self.pair(split, group)
             yield world.render(*contacts, modalities=modalities, sensors=sensors), sensors
 

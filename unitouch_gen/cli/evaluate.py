@@ -112,12 +112,12 @@ def check_table(name: str, joint: Any, pipe: Any, data_sets: Sequence[Any], each
 
 def check_sensors(pipe: Any, data_sets: Sequence[Any]) -> None:
     """Raises if there are touches by sensors that a pipeline does not draw for."""
-    known = {*(pipe.config.sensors or ())}
-    sensors = known & {*NAMED}
+    drawable = {*(pipe.config.sensors or ())}
+    sensors = drawable & {*NAMED}
     if data_sets:
         sensors = {record.sensor for data in data_sets for record in data.records}
-    if not sensors or sensors - known:
-        words = ", ".join(sorted(known))
+    if not sensors or sensors - drawable:
+        words = ", ".join(sorted(drawable))
         raise InvalidInputError(f"The touches are by sensors other than {words}, which `--model` draws for.")
 
 
@@ -169,8 +169,8 @@ def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, eac
     by_images = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     rows: Rows = {}
     generated_for = set[tuple[str, int]]()
-    for sensor, known, seed, splits in sets:
-        domain = "in domain" if known else "out of domain"
+    for sensor, in_domain, seed, splits in sets:
+        domain = "in domain" if in_domain else "out of domain"
         if table in by_label:
             accuracies = by_label[table](splits, embed)
             figures = {row: {f"{sensor}, {domain}": accuracy} for row, accuracy in accuracies.items()}

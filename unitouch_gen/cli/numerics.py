@@ -48,12 +48,12 @@ def work_precision(
     if lora is None and model is None and built_in.is_dir() and find_spec("peft"):
         lora = built_in
     unavailable = {"turbo": lora is None, "default": pipeline is None}
-    known = [name for name in wp.NAMES if not unavailable.get(name)]
-    names = list(dict.fromkeys(by_comma(solvers) or known))
+    available = [name for name in wp.NAMES if not unavailable.get(name)]
+    names = list(dict.fromkeys(by_comma(solvers) or available))
     counts = [check_integer("--steps", value_of(word), 1, 1000) for word in steps.split(",")]
     errors = [check_number("--tolerances", value_of(word), 1e-5, 1.0) for word in tolerances.split(",")]
     for name in names:
-        check_choice("--solvers", name, known)
+        check_choice("--solvers", name, available)
     points = points_of(names, counts, errors)
 
     if problem is not None:

@@ -234,9 +234,10 @@ FEW_LEVELS = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "
 COSINE = {"beta_schedule": "squaredcos_cap_v2"}  # starts at noise level 20 000
 ZERO_SNR = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}  # starts at noise level 4096
 
-PROBLEMS = {
-    problem.name: problem
-    for problem in (
+
+def _problems() -> list[Problem]:
+    """All problems; those that are `stiff` are cases of `stability`."""
+    return [
         Problem("gaussian", gaussian(0.01, 256)),
         Problem("gaussian-guided", NARROW, WIDE, 7.5),
         Problem("gaussian-50-levels", gaussian(0.01), schedule_config=FEW_LEVELS, prediction_type="sample"),
@@ -251,5 +252,7 @@ PROBLEMS = {
         Problem("near-deltas", modes(1e-6), stiff=True),
         Problem("gaussian-cosine", gaussian(0.01), schedule_config=COSINE, prediction_type="v_prediction", stiff=True),
         Problem("pure-noise", gaussian(0.01), schedule_config=ZERO_SNR, prediction_type="v_prediction", stiff=True),
-    )
-}
+    ]
+
+
+PROBLEMS = {problem.name: problem for problem in _problems()}

@@ -88,7 +88,7 @@ def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: 
     slope_x = slope_x[:, 1:-1, 1:-1]
     slope_y = slope_y[:, 1:-1, 1:-1]
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
-    lx, ly, lz = (component[:, None, None] for component in light.unbind(1))
+    lx, ly, lz = light[:, :, None, None].unbind(1)
     lambert = ((lz - lx * slope_x - ly * slope_y) * normal).clamp_min(0.0)
     # Blinn's half vector between lamp and camera (0, 0, 1), with an exponent of 48 by repeated squaring.
     half = torch.rsqrt(2.0 + 2.0 * lz)
