@@ -1,19 +1,17 @@
-"""Base class of the pipelines: argument checks, the steps of a call, reading and saving.
-
-A call checks its arguments (`CallSettings`), encodes its inputs to embeddings of the joint space, turns them into
-conditioning, goes from noise to latents (`_denoise`), and from latents to pictures (`_images`).
-"""
+"""Base class of the pipelines: the checks of a call, encoding, the denoising loops, decoding, reading and saving."""
 
 import copy
+import math
 import os
+import sys
 import tempfile
-from collections.abc import Callable, Container, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import torch
 from diffusers import DiffusionPipeline
@@ -23,8 +21,10 @@ from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.pipeline_utils import StableDiffusionMixin
 from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from unitouch_gen.arguments import MAX_SCALE, SamplingArguments
 from unitouch_gen.conditioning import match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
@@ -33,7 +33,7 @@ from unitouch_gen.errors import (
     check_arguments,
     check_choice,
     check_dtype,
-    check_integer,
+    check_fields,
     check_kind,
     check_number,
     check_tensor,
@@ -42,67 +42,57 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
-from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
+from unitouch_gen.models.images import ImageInput, centre_rectangle, normalise_pixels
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
-from unitouch_gen.sampling import Guidance, Network, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
+from unitouch_gen.sampling import (
+    Denoiser,
+    Guidance,
+    ReturnCode,
+    RunInterruptedError,
+    RunReport,
+    SampleStatus,
+    solve,
+)
 from unitouch_gen.saving import SAVING_OPTIONS, filling
+from unitouch_gen.schedule import alpha
 
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
-Method = TypeVar("Method", bound=Callable[..., Any])
+DIFFUSERS_CALLBACKS = (PipelineCallback, MultiPipelineCallbacks)
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+EndStep = Callable[[int, Tensor, Tensor], Tensor]  # (step, timestep, latents) -> latents to go on from
 
-MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
+SMALL_WORK = 1e10
+"""Weights times positions of an evaluation below which more threads of a CPU than one mostly wait for each other: the
+built-in networks' on four rows, two pictures with guidance, are under it."""
 
-_threads: list[int] = []  # one entry for each running call: the threads that torch had before any of them
-
-
-def runs_networks(method: Method) -> Method:
-    """A method of a pipeline that runs networks: without gradients, and in one thread if its main network is small."""
-
-    @wraps(method)
-    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        weights = list(getattr(self, self._main_network).parameters())
-        if any(one.is_meta for one in weights):
-            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
-        # On a CPU, threads of a network with fewer parameters mostly wait for each other.
-        small = sum(one.numel() for one in weights) < 20_000_000
-        _threads.append([*_threads, torch.get_num_threads()][0])
-        torch.set_num_threads(1 if small else _threads[0])
-        try:
-            with torch.no_grad():
-                return method(self, *args, **kwargs)
-        finally:
-            torch.set_num_threads(_threads[0])
-            _threads.pop()
-
-    return run  # type: ignore[return-value]
+_OPENMP = ThreadpoolController().select(user_api="openmp")
 
 
-@dataclass(frozen=True)
-class CallSettings:
-    """Validated call arguments other than the conditioning."""
+@contextmanager
+def threads_for(work: float) -> Iterator[None]:
+    """Limits the calling thread to one thread of OpenMP where there is little work; see `SMALL_WORK`."""
+    torch.get_num_threads()  # torch sets the number of a thread when it is first asked, which would undo the limit
+    with _OPENMP.limit(limits=1 if work < SMALL_WORK else None):
+        yield
 
-    shape: tuple[int, int, int, int]  # of the latents, (B n, C, h, w)
-    repeats: int  # n, samples of each input
-    device: torch.device
-    steps: Steps
-    guidance: Guidance
-    generator: Generators
-    latents: Tensor | None
-    callback: StepEndCallback | None
-    callback_inputs: Sequence[str]  # names of the tensors the callback gets
-    cross_attention_kwargs: dict[str, Any] | None
-    output_type: str
-    throw: bool
+
+def stack_level() -> int:
+    """The `stacklevel` of a warning, so that it names the line outside of this package that led to it."""
+    frame: Any = sys._getframe(1)
+    level = 1
+    while frame.f_back is not None and frame.f_globals["__name__"].partition(".")[0] in ("unitouch_gen", "torch"):
+        frame = frame.f_back
+        level += 1
+    return level
 
 
 @dataclass(frozen=True)
 class Touches:
-    """Touches to encode: pixel values (B, 3, S, S), the sensor of each, and optional backgrounds."""
+    """Touches to encode: pixels in [0, 1] (B, 3, S, S), the sensor of each, and the sensors untouched, where given."""
 
     pixels: Tensor
     matches: list[SensorMatch]
@@ -116,10 +106,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     `vae` and `embedding_bank`.
     """
 
-    _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
-    _main_network = "unet"
-    _example_call, _example_end = "", 'output.images[0].save("output.png")'  # shown on the model card
-    _task = "image-to-image"  # and its tag
+    _example_call = ""  # shown on the model card
+    _example_end = 'output.images[0].save("output.png")'
+    _task = "image-to-image"  # the card's tag
     text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
     embedding_bank: Any = None  # touch-to-text has none
     _card = Card()
@@ -129,6 +118,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
+        self._weights = self.unet.num_parameters()
         self._check_widths(network)
 
     def _check_widths(self, network: str) -> None:
@@ -152,115 +142,108 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     # Checks of a call, before any network runs ------------------------------------------------------------------------
 
-    def _default(self, name: str, value: Any) -> Any:
-        """The argument, or the checkpoint's default if `None`."""
-        return self.config[f"default_{name}"] if value is None else value
+    def _check_device(self) -> None:
+        if self.device.type == "meta":
+            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
 
-    def _check_call(
-        self, inputs: int, num_images_per_prompt: Any, height: Any, width: Any, num_inference_steps: Any,
-        guidance_scale: Any, solver: Any, tolerance: Any, max_evaluations: Any, eta: Any, generator: Any, latents: Any,
-        output_type: Any, cross_attention_kwargs: Any, callback: Any, callback_inputs: Any, throw: Any,
-        init_strength: Any = 1.0, timesteps: Any = None,
-    ) -> CallSettings:  # fmt: skip
-        """The validated arguments of a call with `inputs` inputs; `None` is the checkpoint's default."""
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, 100_000)
-        check_choice("output_type", output_type, ("pil", "np", "pt", "latent"))
-        check_kind("throw", throw, bool)
-        lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
-        check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
-        scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_SCALE)
-        # The scheduler's own steps are kept unless an argument, which may be of any kind yet, asks for others.
-        whole = isinstance(init_strength, float | int) and init_strength == 1.0
-        own = timesteps is None and solver is None and tolerance is None and whole
-        usual = num_inference_steps is None or (
-            isinstance(num_inference_steps, int) and num_inference_steps == self.config.default_num_inference_steps
-        )
-        if own and usual and "timesteps" in signature(self.scheduler.set_timesteps).parameters:
-            timesteps, num_inference_steps = self.config.default_timesteps, None
-        if timesteps is None and tolerance is None:
-            num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        steps = prepare_steps(
-            self.scheduler, num_inference_steps=num_inference_steps, timesteps=timesteps, solver=solver,
-            tolerance=tolerance, max_evaluations=max_evaluations, eta=eta, init_strength=init_strength,
-            device=self._execution_device,
-        )  # fmt: skip
-        return CallSettings(
-            shape=self._check_shape(inputs * repeats, height, width, generator, latents), repeats=repeats,
-            device=self._execution_device, steps=steps, guidance=Guidance(scale), generator=generator, latents=latents,
-            callback=callback, callback_inputs=self._check_callback(callback, callback_inputs, tolerance),
-            cross_attention_kwargs=cross_attention_kwargs, output_type=output_type, throw=throw,
-        )  # fmt: skip
+    def _check_arguments(self, **given: Any) -> SamplingArguments:
+        """The arguments of a call, checked; guidance and steps are the checkpoint's where they are `None`."""
+        self._check_device()
+        arguments = check_fields(SamplingArguments, **given)
+        config = self.config
+        changes: dict[str, Any] = {}
+        if arguments.guidance_scale is None:
+            changes["guidance_scale"] = check_number("guidance_scale", config.default_guidance_scale, 0.0, MAX_SCALE)
+        if arguments.tolerance is None and arguments.timesteps is None:
+            steps = arguments.num_inference_steps
+            usual = steps in (None, config.default_num_inference_steps)
+            own_steps = usual and arguments.solver is None and arguments.init_strength == 1.0
+            takes_timesteps = "timesteps" in signature(self.scheduler.set_timesteps).parameters
+            if config.default_timesteps is not None and own_steps and takes_timesteps:
+                changes |= {"timesteps": config.default_timesteps, "num_inference_steps": None}
+            elif steps is None:
+                changes["num_inference_steps"] = config.default_num_inference_steps
+        if arguments.bridge is None:
+            changes["bridge"] = self.embedding_bank is not None
+        elif arguments.bridge and self.embedding_bank is None:
+            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
+        return arguments.model_copy(update=changes)
 
-    def _check_shape(
-        self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
-    ) -> tuple[int, int, int, int]:
-        """Shape of the latents, (B n, C, h, w); given latents and a list of generators have to fit it."""
-        factor, trained = self.vae_scale_factor, self.unet.config.sample_size  # one side, or (height, width)
-        trained = trained if isinstance(trained, list | tuple) else (trained, trained)
+    def _latents_shape(self, inputs: int, arguments: SamplingArguments) -> tuple[int, int, int, int]:
+        """(B n, C, h, w), for the size of the pictures, which the UNet was trained at where a call says none."""
+        trained = self.unet.config.sample_size  # one side, or (height, width)
+        if not isinstance(trained, list | tuple):
+            trained = (trained, trained)
         sides = []
-        for name, given, side in zip(("height", "width"), (height, width), trained, strict=True):
-            pixels = check_integer(name, side * factor if given is None and side else given, factor, 16_384)
-            if pixels % factor:
-                raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {factor}.")
-            sides.append(pixels // factor)
-        shape = (batch_size, self.unet.config.out_channels, *sides)
+        for name, side in zip(("height", "width"), trained, strict=True):
+            pixels = getattr(arguments, name)
+            if pixels is None:
+                if not side:
+                    raise InvalidTypeError(f"`{name}` is None, and the UNet has no size of its own; pass an integer.")
+                pixels = side * self.vae_scale_factor
+            if pixels % self.vae_scale_factor:
+                raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {self.vae_scale_factor}.")
+            sides.append(pixels // self.vae_scale_factor)
+        return (inputs * arguments.num_images_per_prompt, self.unet.config.out_channels, *sides)
+
+    def check_inputs(
+        self,
+        shape: Sequence[int],
+        arguments: SamplingArguments,
+        *,
+        generator: Any,
+        latents: Any,
+        cross_attention_kwargs: Any,
+        callback_on_step_end: Any,
+        callback_on_step_end_tensor_inputs: Any,
+    ) -> None:
+        """Raises on arguments of a call that do not fit its latents, of a shape (B n, C, h, w), or each other."""
         if latents is not None:
             check_tensor("latents", latents, *shape)
-        if isinstance(generator, list) and len(generator) != batch_size:
-            raise InvalidInputError(f"`generator` has {len(generator)} for {batch_size} images; pass one, or one each.")
+        if isinstance(generator, list) and len(generator) != shape[0]:
+            raise InvalidInputError(f"`generator` has {len(generator)} for {shape[0]} images; pass one, or one each.")
         for one in generator if isinstance(generator, list) else [generator] * (generator is not None):
             check_kind("generator", one, torch.Generator)
-        return shape
-
-    def _check_callback(self, callback: Any, inputs: Sequence[str], tolerance: float | None) -> Sequence[str]:
-        """Names of the tensors a callback gets; diffusers' own callbacks list theirs."""
-        if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
-            check_unused("callback_on_step_end", tolerance=tolerance)  # it counts steps
-            inputs = callback.tensor_inputs
-        if callback is not None and not callable(callback):
-            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; pass a function.")
-        for name in check_kind("callback_on_step_end_tensor_inputs", inputs, list, tuple):
+        lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
+        check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
+        if callback_on_step_end is not None and not callable(callback_on_step_end):
+            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback_on_step_end)}; pass a function.")
+        if isinstance(callback_on_step_end, DIFFUSERS_CALLBACKS):
+            check_unused("callback_on_step_end", tolerance=arguments.tolerance)  # it counts steps
+        for name in check_kind("callback_on_step_end_tensor_inputs", callback_on_step_end_tensor_inputs, list, tuple):
             check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
-        return inputs
 
-    def _check_bridge(self, bridge: bool | None) -> bool:
-        """Whether to bridge non-image embeddings; default True if there is a bank."""
-        if bridge is None:
-            return self.embedding_bank is not None
-        if check_kind("bridge", bridge, bool) and self.embedding_bank is None:
-            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
-        return bridge
+    # From inputs to embeddings ----------------------------------------------------------------------------------------
 
-    # From inputs to conditioning --------------------------------------------------------------------------------------
-
-    def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
-        """Touches with their sensors and, if given, backgrounds."""
-        model = self._joint("touch")
-        pixels = self.processor.touch(touch)
+    def _read_touches(self, touch: ImageInput, sensor: SensorNames, background: ImageInput = None) -> Touches:
+        """Touches with the sensor of each, named or retrieved; by their backgrounds, where there are any."""
+        _, sensor_bank = self._joint("touch").load("touch")
+        pixels = self.processor.raw_touch(touch)
         if background is None:
-            return Touches(pixels, model.match_sensors(pixels, sensor))
-        backgrounds = self.processor.images(background, name="background")
+            return Touches(pixels, sensor_bank.match(pixels, sensor))
+        backgrounds = self.processor.raw_images(background, name="background")
         check_count("background", len(backgrounds), len(pixels))
         backgrounds = backgrounds.expand_as(pixels)
-        matches = model.match_sensors(backgrounds, sensor, nearest=True)
+        matches = sensor_bank.match(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
             raise InvalidInputError("`background` was given, but this model has no sensor prototypes; leave it out.")
         return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
         """Embeddings (B, D) of touches; warns of those that are out of distribution or untouched."""
-        model, pixels, background = self.unitouch, touches.pixels, touches.background
-        if background is not None:
-            pixels = model.recentre(pixels, background, touches.matches)
-        features, reasons = model.encode_touches(pixels, model.sensor_ids(touches.matches))
+        model = self.unitouch
+        pixels = touches.pixels
+        if touches.background is not None:
+            pixels = model.recentre(pixels, touches.background, touches.matches)
+        features, reasons = model.encode_touches(normalise_pixels(pixels), model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
-        if background is not None:
-            untouched = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
+        if touches.background is not None:
+            untouched = is_untouched(touches.pixels, touches.background).tolist()
             reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
-            warn_of_unknown(reasons, stacklevel=6)  # the line that called the pipeline
+            warn_of_unknown(reasons, stacklevel=1 + stack_level())
         return self._match_norm(features, "touch", throw)
 
     def _match_norm(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
@@ -276,89 +259,206 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             )
         return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(failed[:, None], float("nan"))
 
-    def _encode_pictures(self, name: str, pictures: ImageInput, settings: CallSettings) -> Tensor:
-        """Scaled latents (B, C, h, w) of pictures, cropped to the output size."""
-        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
-        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
+    def _encode_pictures(self, pictures: Sequence[Tensor], shape: Sequence[int]) -> Tensor:
+        """Scaled latents (B, C, h, w) of pictures of `load_images`, cropped to the size of latents of a shape."""
+        height, width = (side * self.vae_scale_factor for side in shape[-2:])
+        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in pictures])
         return encode(self.vae, 2.0 * pixels - 1.0).float()
 
-    # From conditioning to pictures ------------------------------------------------------------------------------------
+    # From noise to pictures -------------------------------------------------------------------------------------------
 
-    def _denoise(
-        self, settings: CallSettings, hidden_states: Tensor, class_labels: Tensor | None, report: RunReport,
-        init: Tensor | None = None, extra_channels: Tensor | None = None,
-        wrap: Callable[[Network], Network] | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Noise -> latents (B n, C, h, w) in float32.
+    def prepare_latents(
+        self,
+        shape: tuple[int, ...],
+        steps: Any,
+        generator: Generators,
+        latents: Tensor | None,
+        init: Tensor | None = None,
+    ) -> Tensor:
+        """The state to start from, float32 (B n, C, h, w): noise at the first noise level of the steps.
 
         Args:
-            hidden_states, class_labels: The UNet's conditioning; with guidance the unconditional half first.
-            init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
-            extra_channels: Additional input channels (B n, C', h, w), the same in both halves.
-            wrap: Changes what the network predicts.
+            steps: Of `prepare_steps`; the state is in the scale of its scheduler, or variance-exploding.
+            latents: Unit-variance noise, drawn if `None`.
+            init: Scaled latents that the noise is added to (SDEdit; Meng et al., 2022).
         """
-        device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
-        noise = settings.latents
-        if noise is None:
-            single = torch.float32 if dtype == torch.float64 else dtype  # a seed is the same noise in both
-            noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=single)
-        hidden_states = hidden_states.to(device, dtype)
-        if class_labels is not None:
-            class_labels = class_labels.to(device, dtype if class_labels.is_floating_point() else None)
+        device = self._execution_device
+        if latents is None:
+            # A seed is the same noise in float64.
+            dtype = torch.float32 if self.unet.dtype == torch.float64 else self.unet.dtype
+            latents = randn_tensor(shape, generator=generator, device=device, dtype=dtype)
+        noise = latents.to(device, torch.float32)
+        if isinstance(steps, list):
+            return noise * math.hypot(1.0, steps[0]) if init is None else init + steps[0] * noise
+        if init is None:
+            return noise * steps.init_noise_sigma
+        return steps.add_noise(init, noise, steps.timesteps[:1].expand(len(init)))
 
-        def network(state: Tensor, timestep: Tensor) -> Tensor:
-            rows, held = len(state), len(hidden_states)  # rows: B n, or 2 B n with guidance
-            allowed = (1, batch_size, 2 * batch_size) if rows == batch_size else (rows,)
-            if held not in allowed:
-                raise InvalidInputError(
-                    f"`callback_on_step_end` left {held} rows of `{self._hidden_states_name}` for {rows} states; for "
-                    "guidance return both halves, and start with a `guidance_scale` above 1."
-                )
-            if extra_channels is not None:
-                state = torch.cat([state, extra_channels.repeat(rows // batch_size, 1, 1, 1).to(state)], dim=1)
-            return self.unet(
-                state.to(dtype),
-                timestep,
-                encoder_hidden_states=hidden_states.expand(rows, -1, -1) if held == 1 else hidden_states[-rows:],
-                class_labels=None if class_labels is None else class_labels[-rows:],
-                cross_attention_kwargs=settings.cross_attention_kwargs,
-                return_dict=False,
-            )[0]
+    def _threads(self, shape: Sequence[int], guidance: Guidance) -> Any:
+        """Threads for evaluations on latents (B n, C, h, w); see `threads_for`."""
+        samples, _, height, width = shape
+        return threads_for(self._weights * samples * (1 + guidance.active) * height * width)
 
-        # A callback gets a copy of the pipeline: other calls may run on this one.
-        caller, total = copy.copy(self), settings.steps.count or 100
-        caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, total, False
-
-        def on_step(step: int, timestep: Tensor, latents: Tensor, run: Run) -> Tensor:
-            nonlocal hidden_states
-            tensors = {"latents": latents, self._hidden_states_name: hidden_states}
-            inputs = {name: tensors[name] for name in settings.callback_inputs}
-            changed = settings.callback(caller, step, timestep, inputs) or {}  # type: ignore[misc]
-            check_kind("callback_on_step_end: what it returned", changed, dict)
-            name, width = f"callback_on_step_end: {self._hidden_states_name}", hidden_states.shape[-1]
-            states = changed.get(self._hidden_states_name, hidden_states)
-            hidden_states = check_tensor(name, states, "B", "T", width, finite=False).to(hidden_states)
-            scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_SCALE, MAX_SCALE)
-            run.guidance, run.interrupted = Guidance(scale), caller._interrupt
-            return changed.get("latents", latents)
-
-        with report.stage("denoising"), self.progress_bar(total=total) as bar:
-            result = sample(
-                network if wrap is None else wrap(network),
-                noise.to(device),
-                settings.steps,
-                report,
-                guidance=settings.guidance,
-                init=init,
-                generator=settings.generator,
-                throw=settings.throw,
-                on_step=on_step if settings.callback else None,
-                progress=lambda share: bar.update(round(share * total) - bar.n),
-            )
-        self._guidance_scale, self._num_timesteps, self._interrupt = caller._guidance_scale, total, caller._interrupt
+    def _denoise(
+        self,
+        denoise: Denoiser,
+        latents: Tensor,
+        steps: Any,
+        arguments: SamplingArguments,
+        report: RunReport,
+        *,
+        generator: Generators,
+        callback: StepEndCallback | None,
+        callback_inputs: Sequence[str],
+    ) -> Tensor:
+        """The state of `prepare_latents` -> latents (B n, C, h, w), float32; counts and codes go into the report."""
+        # A callback is passed a copy of the pipeline with the state of its own call: others may run on this one.
+        pipe = self if callback is None else copy.copy(self)
+        pipe._guidance_scale = denoise.guidance.scale
+        pipe._interrupt = False
+        end_step = None
+        if callback is not None:
+            if isinstance(callback, DIFFUSERS_CALLBACKS):
+                callback_inputs = callback.tensor_inputs
+            end_step = partial(pipe._end_step, callback, callback_inputs, denoise)
+        with report.stage("denoising"):
+            run = pipe._run_solver if isinstance(steps, list) else pipe._run_scheduler
+            latents = run(denoise, latents, steps, arguments, report, generator=generator, end_step=end_step)
+        self._guidance_scale = pipe._guidance_scale
+        self._num_timesteps = pipe._num_timesteps
+        self._interrupt = pipe._interrupt
         if not report.guided:
             report.left_out.append("unconditional branch")
-        return result
+        return latents
+
+    def _run_scheduler(
+        self,
+        denoise: Denoiser,
+        latents: Tensor,
+        scheduler: Any,
+        arguments: SamplingArguments,
+        report: RunReport,
+        *,
+        generator: Generators,
+        end_step: EndStep | None,
+    ) -> Tensor:
+        """diffusers' denoising loop, for any of its schedulers."""
+        timesteps = scheduler.timesteps
+        status = SampleStatus(len(latents), latents.device)
+        ended = ReturnCode.SUCCESS
+        self._num_timesteps = len(timesteps)
+        report.solver = type(scheduler).__name__
+        report.steps = len(arguments.timesteps) if arguments.timesteps else scheduler.num_inference_steps
+        sigmas = [] if denoise.edit is None else denoise.schedule.sigma(timesteps.cpu()).tolist()
+        options: dict[str, Any] = {}
+        parameters = signature(scheduler.step).parameters
+        if "generator" in parameters:
+            options["generator"] = generator
+        if "eta" in parameters:
+            options["eta"] = arguments.eta
+        with self.progress_bar(total=len(timesteps)) as bar:
+            for step, timestep in enumerate(timesteps):
+                z = scheduler.scale_model_input(latents, timestep)
+                if step > 0:
+                    status.update(step - 1, z)
+                if self._interrupt:
+                    ended = ReturnCode.INTERRUPTED
+                    break
+                prediction = denoise.predict(z, timestep)
+                if denoise.edit is not None:
+                    prediction = denoise.edit_prediction(prediction, z, sigmas[step])
+                latents = scheduler.step(prediction, timestep, latents, **options, return_dict=False)[0]
+                if end_step is not None:
+                    latents = end_step(step, timestep, latents)
+                bar.update()
+            else:
+                status.update(step, latents)
+        status.conclude(report, denoise, ended, arguments.throw)
+        return latents
+
+    def _run_solver(
+        self,
+        denoise: Denoiser,
+        x: Tensor,
+        sigmas: list[float],
+        arguments: SamplingArguments,
+        report: RunReport,
+        *,
+        generator: Generators,
+        end_step: EndStep | None,
+    ) -> Tensor:
+        """A named solver, or adaptive steps."""
+        adaptive = arguments.tolerance is not None
+        total = 100 if adaptive else len(sigmas) - 1
+        status = SampleStatus(len(x), x.device)
+        self._num_timesteps = total
+        report.solver = arguments.solver or "adaptive"
+        latents = x
+        begin = sigmas[0]  # noise level that a step begins at
+
+        def callback(step: int, x: Tensor, sigma: float) -> Tensor:
+            nonlocal latents, begin
+            latents = x * alpha(sigma)
+            if end_step is not None:
+                changed = end_step(step, denoise.timestep(begin, x.device), latents.clone())
+                x = torch.where(changed == latents, x, changed / alpha(sigma))
+                latents = changed
+            status.update(step, latents)
+            report.steps = step + 1
+            begin = sigma
+            done = step + 1
+            if adaptive:
+                first, last = sigmas
+                done = 100 if sigma <= last else round(100 * math.log(first / sigma) / math.log(first / last))
+            bar.update(done - bar.n)
+            if self._interrupt and sigma > 0.0:
+                raise RunInterruptedError
+            return x
+
+        with self.progress_bar(total=total) as bar:
+            try:
+                latents, ended = solve(denoise, x, sigmas, arguments, callback, generator)
+            except RunInterruptedError:
+                ended = ReturnCode.INTERRUPTED
+        if not adaptive:
+            report.steps = total
+        if ended is ReturnCode.MAX_EVALUATIONS:
+            status.update(report.steps, latents)
+        status.conclude(report, denoise, ended, arguments.throw)
+        return latents
+
+    def _end_step(
+        self,
+        callback: StepEndCallback,
+        names: Sequence[str],
+        denoise: Denoiser,
+        step: int,
+        timestep: Tensor,
+        latents: Tensor,
+    ) -> Tensor:
+        """Runs a user's callback after a step, which may change embeddings, guidance and the latents, returned here."""
+        embeds_name = self._callback_tensor_inputs[-1]
+        embeds = denoise.conditions["encoder_hidden_states"]
+        tensors = {"latents": latents, embeds_name: embeds}
+        changed = callback(self, step, timestep, {name: tensors[name] for name in names}) or {}
+        check_kind("callback_on_step_end: what it returned", changed, dict)
+        new_latents = changed.get("latents", latents)
+        check_tensor("callback_on_step_end: latents", new_latents, *latents.shape, finite=False)
+        new_embeds = changed.get(embeds_name, embeds)
+        check_tensor(f"callback_on_step_end: {embeds_name}", new_embeds, "B", "T", embeds.shape[-1], finite=False)
+        scale = check_number("callback_on_step_end: _guidance_scale", self._guidance_scale, -MAX_SCALE, MAX_SCALE)
+        denoise.guidance = Guidance(scale)
+        samples = len(latents)
+        allowed = (2 * samples,) if denoise.guidance.active else (1, samples, 2 * samples)
+        if len(new_embeds) not in allowed:
+            raise InvalidInputError(
+                f"`callback_on_step_end` left {len(new_embeds)} rows of `{embeds_name}` for {samples} samples; for "
+                "guidance return both halves, and start with a `guidance_scale` above 1."
+            )
+        if len(new_embeds) == 1:
+            new_embeds = new_embeds.expand(samples, -1, -1)
+        denoise.conditions["encoder_hidden_states"] = new_embeds.to(embeds)
+        return new_latents.to(latents)
 
     # What diffusers' callbacks read: in a callback, of the running call; otherwise, of the last call.
     _guidance_scale: float
@@ -369,23 +469,25 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     num_timesteps = property(lambda self: self._num_timesteps)
     interrupt = property(lambda self: self._interrupt)
 
-    def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
+    def _decode(self, latents: Tensor, arguments: SamplingArguments, report: RunReport) -> Any:
         """Latents (B, C, h, w) -> pictures of the output type, of the samples that are finite."""
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        if settings.output_type == "latent":
+        if arguments.output_type == "latent":
             report.left_out.append("VAE decoder")
             return latents[rows]
-        pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        height, width = latents.shape[-2:]
+        pixels = latents.new_zeros(0, 3, height * self.vae_scale_factor, width * self.vae_scale_factor)
         with report.stage("decoding"):
             if rows:
                 pixels = decode(self.vae, latents[rows])
                 finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
                 for row in torch.tensor(rows)[~finite.cpu()].tolist():
-                    if settings.throw:
+                    if arguments.throw:
                         raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
-                    report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+                    report.codes[row] = ReturnCode.NON_FINITE
+                    report.failed_at[row] = report.steps
                 pixels = pixels[finite]
-            return self.image_processor.postprocess(pixels, output_type=settings.output_type)
+            return self.image_processor.postprocess(pixels, output_type=arguments.output_type)
 
     # Reading and saving -----------------------------------------------------------------------------------------------
 
@@ -403,7 +505,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         check_arguments("`from_pretrained`", kwargs, {*LOADING_OPTIONS, *components, *defaults})
         if kwargs.get("use_safetensors") is False:
             raise InvalidInputError("`use_safetensors` is False, but only safetensors are read; leave it out.")
-        name, kwargs = "pretrained_model_name_or_path", {**kwargs, "use_safetensors": True}
+        name = "pretrained_model_name_or_path"
+        kwargs = {**kwargs, "use_safetensors": True}
         key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
         kwargs.setdefault(key, torch.float32)
         if not isinstance(kwargs[key], dict):  # dict: dtypes by component
@@ -428,9 +531,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return loaded
 
     def save_pretrained(
-        self, save_directory: str | os.PathLike, safe_serialization: bool = True, *args: Any,
-        card: Card | None = None, **kwargs: Any,
-    ) -> None:  # fmt: skip
+        self,
+        save_directory: str | os.PathLike,
+        safe_serialization: bool = True,
+        *args: Any,
+        card: Card | None = None,
+        **kwargs: Any,
+    ) -> None:
         """Writes the pipeline into a folder, as `DiffusionPipeline.save_pretrained` does; other files there stay.
 
         Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
@@ -477,7 +584,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """
         own = ("adapter_name", "hotswap", "return_lora_metadata", "unet_config", "weight_name")
         check_arguments("`load_lora_weights`", kwargs, {*LOADING_OPTIONS, *own})
-        name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
+        name = "pretrained_model_name_or_path_or_dict"
+        place = pretrained_model_name_or_path_or_dict
         with nullcontext() if isinstance(place, dict) else reading(name, place):
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
 

@@ -1,29 +1,29 @@
 """`TactileStylizationPipeline`: a photo restyled by a touch (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.conditioning import mix_linear, mix_to_norm
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_number
-from unitouch_gen.models.images import ImageInput
+from unitouch_gen.errors import InvalidInputError, check_number
+from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.pipelines.base import (
-    MAX_SCALE,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
     check_count,
     check_weights,
-    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
-from unitouch_gen.sampling import Network, RunReport, trained_for
-from unitouch_gen.schedule import NoiseSchedule, to_denoised
+from unitouch_gen.sampling import Denoiser, Guidance, RunReport, prepare_steps
+from unitouch_gen.schedule import NoiseSchedule
 
 MIXES = {"linear": mix_to_norm, "paper": mix_linear}
 
@@ -37,24 +37,13 @@ def coarse(values: Tensor, cells: int, keep_colours: bool) -> Tensor:
     return smooth if keep_colours else smooth - smooth.mean(dim=(2, 3), keepdim=True)
 
 
-def hold_layout(
-    network: Network, photo: Tensor, schedule: NoiseSchedule, prediction_type: str, cells: int, keep_colours: bool
-) -> Network:
-    """A network that holds the layout of photos, as ILVR does (Choi et al., 2021, Equation 8).
+def hold_layout(denoised: Tensor, photo: Tensor, cells: int, keep_colours: bool) -> Tensor:
+    """Predicted latents (B, C, h, w) with the layout of photos' latents, as in ILVR (Choi et al., 2021, Equation 8).
 
-    The coarse part F of what it predicts of the clean latents becomes that of the photos' latents (B, C, h, w):
-    D' = D + F(photo - D). Only the denoiser changes: every solver, adaptive steps and guidance run as they are.
+    The coarse part F of the prediction becomes that of the photo: D' = D + F(photo - D). Only the denoiser changes:
+    every solver, adaptive steps and guidance run as they are.
     """
-
-    def held(z: Tensor, timestep: Tensor) -> Tensor:
-        prediction, sigma = network(z, timestep).float(), schedule.sigma(timestep.cpu()).item()
-        denoised = to_denoised(prediction, z, sigma, prediction_type)
-        one = torch.ones((), dtype=torch.float32)
-        slope = to_denoised(one, 0.0 * one, sigma, prediction_type).item()  # dD / dprediction
-        target = photo.float().repeat(len(z) // len(photo), 1, 1, 1)
-        return prediction + coarse(target - denoised, cells, keep_colours) / slope
-
-    return held
+    return denoised + coarse(photo - denoised, cells, keep_colours)
 
 
 class TactileStylizationPipeline(TouchToImagePipeline):
@@ -65,24 +54,44 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
     _example_call = 'pipe(example("wood", "image"), example("gravel"))'
 
-    @runs_networks
+    @torch.no_grad()
     def __call__(  # type: ignore[override]
         self,
-        image: ImageInput = None, touch: ImageInput = None, prompt: str | list[str] | None = None,
-        touch_weight: float | None = None, image_weight: float | None = None, mix: str = "linear",
-        layout: int | None = 14, keep_colours: bool = False, init_strength: float = 1.0,
-        height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
+        image: ImageInput = None,
+        touch: ImageInput = None,
+        prompt: str | list[str] | None = None,
+        touch_weight: float | None = None,
+        image_weight: float | None = None,
+        mix: str = "linear",
+        layout: int | None = 14,
+        keep_colours: bool = False,
+        init_strength: float = 1.0,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
         guidance_scale: float | None = None,
-        strength: float = 1.0, negative_prompt: str | list[str] | None = None,
-        num_images_per_prompt: int = 1, noise_level: int | None = None,
-        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
-        solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
-        generator: Generators = None, latents: Tensor | None = None,
-        prompt_embeds: Tensor | None = None, negative_prompt_embeds: Tensor | None = None,
-        output_type: str = "pil", return_dict: bool = True,
-        cross_attention_kwargs: dict[str, Any] | None = None, callback_on_step_end: StepEndCallback | None = None,
-        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",), throw: bool = True,
-    ) -> UniTouchPipelineOutput | tuple:  # fmt: skip
+        strength: float = 1.0,
+        negative_prompt: str | list[str] | None = None,
+        num_images_per_prompt: int = 1,
+        noise_level: int | None = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        bridge: bool | None = None,
+        solver: str | None = None,
+        tolerance: float | None = None,
+        max_evaluations: int | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        prompt_embeds: Tensor | None = None,
+        negative_prompt_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
         """Restyles photos by touches.
 
         The other arguments, the output, errors and warnings are those of `TouchToImagePipeline.__call__`.
@@ -113,64 +122,127 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             >>> pipe("photo.jpg", "brick.png", layout=None)  # as in the paper
         """
         # 1. Check inputs, before any network runs
-        strength = check_number("strength", strength, 0.0, MAX_SCALE)
-        check_choice("mix", mix, MIXES)
-        check_kind("keep_colours", keep_colours, bool)
-        if layout is not None:
-            cells, (schedule, prediction_type) = check_integer("layout", layout, 2), trained_for(self.scheduler)
+        for name, value in (("image", image), ("touch", touch)):
+            if value is None:
+                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
         if touch_weight is None:
             touch_weight = 0.3 if layout is None else 0.7
         if image_weight is None:
             image_weight = 1.0 - check_number("touch_weight", touch_weight, 0.0, 1.0)
-        weights = check_weights("touch_weight, image_weight", [touch_weight, image_weight])
-        noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
-        for name, value in (("image", image), ("touch", touch)):
-            if value is None:
-                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
-        touches, photos = self._prepare_touch(touch, sensor, background), self.processor.images(image)
-        fewer, batch_size = sorted((len(photos), len(touches.pixels)))
-        check_count("image, touch", fewer, batch_size)
-        settings = self._check_call(
-            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
-            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
-            callback_on_step_end_tensor_inputs, throw, init_strength,
-        )  # fmt: skip
-        positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        prompts = self._check_prompts(batch_size, settings.guidance, positive, negative)
-
-        # 2. Encode photos and touches, and mix their embeddings
+        arguments = self._check_arguments(
+            touch_weight=touch_weight,
+            image_weight=image_weight,
+            mix=mix,
+            layout=layout,
+            keep_colours=keep_colours,
+            init_strength=init_strength,
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            guidance_scale=guidance_scale,
+            strength=strength,
+            num_images_per_prompt=num_images_per_prompt,
+            noise_level=self.config.default_noise_level if noise_level is None else noise_level,
+            bridge=bridge,
+            solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            output_type=output_type,
+            throw=throw,
+        )
+        weights = check_weights("touch_weight, image_weight", [arguments.touch_weight, arguments.image_weight])
+        touches = self._read_touches(touch, sensor, background)
+        photos = load_images("image", image)
+        batch_size = max(len(photos), len(touches.pixels))
+        check_count("image, touch", min(len(photos), len(touches.pixels)), batch_size)
+        shape = self._latents_shape(batch_size, arguments)
+        guidance = Guidance(arguments.guidance_scale)
+        self.check_inputs(
+            shape,
+            arguments,
+            generator=generator,
+            latents=latents,
+            cross_attention_kwargs=cross_attention_kwargs,
+            callback_on_step_end=callback_on_step_end,
+            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
+        )
+        prompts = self._check_prompts(
+            batch_size,
+            guidance,
+            prompt=prompt,
+            prompt_embeds=prompt_embeds,
+            negative_prompt=negative_prompt,
+            negative_prompt_embeds=negative_prompt_embeds,
+        )
+        steps, schedule = prepare_steps(self.scheduler, arguments, self._execution_device)
+        if arguments.layout is not None:
+            schedule = NoiseSchedule.of(self.scheduler)
         report = RunReport()
-        with report.stage("mix"):
-            embeds = self._mixed(photos, touches, weights, batch_size, mix, strength, bridge, report, throw)
 
-        # 3. Encode the photo's own latents
-        photo: Any = None
-        if init_strength < 1.0 or layout is not None:
-            with report.stage("photo latents"):
-                photo = self._encode_pictures("image", image, settings).expand(batch_size, -1, -1, -1)
-                photo = photo.repeat_interleave(settings.repeats, dim=0)
+        with self._threads(shape, guidance):
+            # 2. Encode photos and touches and mix their embeddings, and encode the prompts
+            with report.stage("mix"):
+                parts = self._embeds(photos, touches, weights, arguments, report)
+                stacked = torch.stack([part.expand(batch_size, -1) for part in parts])
+                shares = torch.tensor([weight for weight in weights if weight > 0])
+                embeds = arguments.strength * MIXES[arguments.mix](stacked, shares.to(stacked))
+            conditions = {
+                "encoder_hidden_states": self._encode_prompts(prompts, shape[0], cross_attention_kwargs, report),
+                "class_labels": self._class_labels(embeds, arguments, guidance, generator),
+                "cross_attention_kwargs": cross_attention_kwargs,
+            }
 
-        # 4. Generate from the mixed embedding
-        init = photo if init_strength < 1.0 else None
-        held = None if layout is None else (photo, schedule, prediction_type, cells, keep_colours)
-        wrap = None if held is None else lambda network: hold_layout(network, *held)
-        images = self._generate(settings, embeds, noise_level, prompts, report, init, wrap)
-        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
+            # 3. Encode the photo's own latents
+            photo: Any = None
+            if arguments.init_strength < 1.0 or arguments.layout is not None:
+                with report.stage("photo latents"):
+                    photo = self._encode_pictures(photos, shape)
+                    photo = photo.repeat_interleave(shape[0] // len(photo), dim=0)
 
-    def _mixed(
-        self, photos: Tensor, touches: Touches, weights: list[float], batch_size: int, mix: str, strength: float,
-        bridge: bool, report: RunReport, throw: bool,
-    ) -> Tensor:  # fmt: skip
-        """Mixed embeddings (B, D) by the weights of touches and photos; an encoder of zero weight does not run."""
-        parts, shares = list[Tensor](), [weight for weight in weights if weight > 0]  # (1 or B, D) each
-        if weights[0] > 0:
-            embeds = self._touch_embeds(touches, report, throw)
-            parts.append(self.embedding_bank.bridge(embeds) if bridge else embeds)
+            # 4. Denoise, from the photo's latents where there is an `init_strength`, and hold their layout
+            init = photo if arguments.init_strength < 1.0 else None
+            noise = self.prepare_latents(shape, steps, generator, latents, init)
+            edit = None
+            if arguments.layout is not None:
+                edit = partial(hold_layout, photo=photo, cells=arguments.layout, keep_colours=arguments.keep_colours)
+            latents = self._denoise(
+                Denoiser(self.unet, schedule, conditions, guidance, edit=edit),
+                noise,
+                steps,
+                arguments,
+                report,
+                generator=generator,
+                callback=callback_on_step_end,
+                callback_inputs=callback_on_step_end_tensor_inputs,
+            )
+
+            # 5. Decode the finite samples
+            images = self._decode(latents, arguments, report)
+        self.maybe_free_model_hooks()
+        if not return_dict:
+            return images, report
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
+
+    def _embeds(
+        self,
+        photos: list[Tensor],
+        touches: Touches,
+        weights: Sequence[float],
+        arguments: SamplingArguments,
+        report: RunReport,
+    ) -> list[Tensor]:
+        """Embeddings (1 or B, D) of touches and photos, in this order; an encoder of zero weight does not run."""
+        touch_weight, image_weight = weights
+        parts = []
+        if touch_weight > 0:
+            embeds = self._touch_embeds(touches, report, arguments.throw)
+            parts.append(self.embedding_bank.bridge(embeds) if arguments.bridge else embeds)
         else:
             report.left_out.append("touch encoder")
-        if weights[1] > 0:
-            parts.append(self._match_norm(self.unitouch.get_image_features(photos), "image", throw))
+        if image_weight > 0:
+            features = self.unitouch.get_image_features(self.processor.images(photos))
+            parts.append(self._match_norm(features, "image", arguments.throw))
         else:
             report.left_out.append("image encoder")
-        stacked = torch.stack([part.expand(batch_size, -1) for part in parts])
-        return strength * MIXES[mix](stacked, torch.tensor(shares).to(stacked))
+        return parts

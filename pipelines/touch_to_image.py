@@ -1,7 +1,7 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
@@ -19,6 +19,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 
+from unitouch_gen.arguments import MAX_SCALE, SamplingArguments
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
@@ -34,19 +35,16 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.base import (
-    MAX_SCALE,
-    CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
     UniTouchPipeline,
     check_count,
-    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import read_joint, read_unclip
-from unitouch_gen.sampling import Guidance, Network, RunReport
+from unitouch_gen.sampling import Denoiser, Guidance, RunReport, prepare_steps
 
 
 class TouchToImagePipeline(UniTouchPipeline):
@@ -74,28 +72,48 @@ class TouchToImagePipeline(UniTouchPipeline):
     _example_call = 'pipe(example("brick"))'
 
     def __init__(
-        self, image_normalizer: StableUnCLIPImageNormalizer, image_noising_scheduler: KarrasDiffusionSchedulers,
-        unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers, vae: AutoencoderKL | AutoencoderTiny,
-        unitouch: UniTouchModel | None = None, processor: UniTouchProcessor | None = None,
-        tokenizer: CLIPTokenizer | None = None, text_encoder: CLIPTextModel | None = None,
-        embedding_bank: EmbeddingBank | None = None, default_strength: float = 0.75,
-        default_guidance_scale: float = 9.0, default_num_inference_steps: int = 50, default_noise_level: int = 0,
+        self,
+        image_normalizer: StableUnCLIPImageNormalizer,
+        image_noising_scheduler: KarrasDiffusionSchedulers,
+        unet: UNet2DConditionModel,
+        scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderTiny,
+        unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        text_encoder: CLIPTextModel | None = None,
+        embedding_bank: EmbeddingBank | None = None,
+        default_strength: float = 0.75,
+        default_guidance_scale: float = 9.0,
+        default_num_inference_steps: int = 50,
+        default_noise_level: int = 0,
         default_timesteps: list[int] | None = None,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.register_modules(
-            unitouch=unitouch, processor=processor, image_normalizer=image_normalizer,
-            image_noising_scheduler=image_noising_scheduler, tokenizer=tokenizer, text_encoder=text_encoder,
-            embedding_bank=embedding_bank, unet=unet, scheduler=scheduler, vae=vae,
-        )  # fmt: skip
-        width, labels = self.embedding_dim, unet.config.projection_class_embeddings_input_dim
+            unitouch=unitouch,
+            processor=processor,
+            image_normalizer=image_normalizer,
+            image_noising_scheduler=image_noising_scheduler,
+            tokenizer=tokenizer,
+            text_encoder=text_encoder,
+            embedding_bank=embedding_bank,
+            unet=unet,
+            scheduler=scheduler,
+            vae=vae,
+        )
+        width = self.embedding_dim
+        labels = unet.config.projection_class_embeddings_input_dim
         if labels != 2 * width:
             raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
         self._finish_init(
-            "the unCLIP model", default_strength=default_strength, default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps, default_noise_level=default_noise_level,
+            "the unCLIP model",
+            default_strength=default_strength,
+            default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps,
+            default_noise_level=default_noise_level,
             default_timesteps=default_timesteps,
-        )  # fmt: skip
+        )
 
     @property
     def embedding_dim(self) -> int:
@@ -104,22 +122,39 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     # One call ---------------------------------------------------------------------------------------------------------
 
-    @runs_networks
+    @torch.no_grad()
     def __call__(
         self,
-        touch: ImageInput = None, prompt: str | list[str] | None = None,
-        height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, guidance_scale: float | None = None,
-        strength: float | None = None, negative_prompt: str | list[str] | None = None,
-        num_images_per_prompt: int = 1, noise_level: int | None = None,
-        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
-        solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
-        generator: Generators = None, latents: Tensor | None = None, touch_embeds: Tensor | None = None,
-        prompt_embeds: Tensor | None = None, negative_prompt_embeds: Tensor | None = None,
-        output_type: str = "pil", return_dict: bool = True,
-        cross_attention_kwargs: dict[str, Any] | None = None, callback_on_step_end: StepEndCallback | None = None,
-        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",), throw: bool = True,
-    ) -> UniTouchPipelineOutput | tuple:  # fmt: skip
+        touch: ImageInput = None,
+        prompt: str | list[str] | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None,
+        guidance_scale: float | None = None,
+        strength: float | None = None,
+        negative_prompt: str | list[str] | None = None,
+        num_images_per_prompt: int = 1,
+        noise_level: int | None = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        bridge: bool | None = None,
+        solver: str | None = None,
+        tolerance: float | None = None,
+        max_evaluations: int | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        touch_embeds: Tensor | None = None,
+        prompt_embeds: Tensor | None = None,
+        negative_prompt_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
         """Generates pictures from touches.
 
         Args:
@@ -176,88 +211,159 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
-            raise InvalidInputError("`touch` or `touch_embeds` has to be passed, one of them.")
-        embeds: Any = touch_embeds
-        if touch is None:
-            check_tensor("touch_embeds", embeds, "B", self.embedding_dim)
+            raise InvalidInputError("Either `touch` or `touch_embeds` has to be passed.")
+        arguments = self._check_arguments(
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            timesteps=timesteps,
+            guidance_scale=guidance_scale,
+            strength=self.config.default_strength if strength is None else strength,
+            num_images_per_prompt=num_images_per_prompt,
+            noise_level=self.config.default_noise_level if noise_level is None else noise_level,
+            bridge=bridge,
+            solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            output_type=output_type,
+            throw=throw,
+        )
+        if touch_embeds is not None:
+            check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
             check_unused("touch_embeds", strength=strength, sensor=sensor, background=background, bridge=bridge or None)
-        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
-        bridge = self._check_bridge(bridge)
-        touches = None if touch is None else self._prepare_touch(touch, sensor, background)
-        inputs = len(embeds if touches is None else touches.pixels)
-        settings = self._check_call(
-            inputs, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
-            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
-            callback_on_step_end_tensor_inputs, throw, timesteps=timesteps,
-        )  # fmt: skip
-        noise_level = self._check_noise_level(noise_level)
-        positive, negative = (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
-        prompts = self._check_prompts(inputs, settings.guidance, positive, negative)
-
-        # 2. Encode the touch
+        touches = None if touch is None else self._read_touches(touch, sensor, background)
+        batch_size = len(touch_embeds if touches is None else touches.pixels)  # type: ignore[arg-type]
+        shape = self._latents_shape(batch_size, arguments)
+        guidance = Guidance(arguments.guidance_scale)
+        self.check_inputs(
+            shape,
+            arguments,
+            generator=generator,
+            latents=latents,
+            cross_attention_kwargs=cross_attention_kwargs,
+            callback_on_step_end=callback_on_step_end,
+            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
+        )
+        prompts = self._check_prompts(
+            batch_size,
+            guidance,
+            prompt=prompt,
+            prompt_embeds=prompt_embeds,
+            negative_prompt=negative_prompt,
+            negative_prompt_embeds=negative_prompt_embeds,
+        )
+        steps, schedule = prepare_steps(self.scheduler, arguments, self._execution_device)
         report = RunReport()
-        if touches is None:
-            report.left_out.append("touch encoder")
-        else:
-            with report.stage("touch"):
-                embeds = self._encode(touches, strength, bridge, report, throw)
-        if self.embedding_bank is not None and (touches is None or not bridge):
-            report.left_out.append("embedding bank")
 
-        # 3. Generate from its embedding
-        images = self._generate(settings, embeds, noise_level, prompts, report)
+        with self._threads(shape, guidance):
+            # 2. Encode the touch and the prompts
+            embeds: Any = touch_embeds
+            if touches is None:
+                report.left_out.append("touch encoder")
+            else:
+                with report.stage("touch"):
+                    embeds = self._encode(touches, arguments, report)
+            if self.embedding_bank is not None and (touches is None or not arguments.bridge):
+                report.left_out.append("embedding bank")
+            conditions = {
+                "encoder_hidden_states": self._encode_prompts(prompts, shape[0], cross_attention_kwargs, report),
+                "class_labels": self._class_labels(embeds, arguments, guidance, generator),
+                "cross_attention_kwargs": cross_attention_kwargs,
+            }
+
+            # 3. Denoise
+            noise = self.prepare_latents(shape, steps, generator, latents)
+            latents = self._denoise(
+                Denoiser(self.unet, schedule, conditions, guidance),
+                noise,
+                steps,
+                arguments,
+                report,
+                generator=generator,
+                callback=callback_on_step_end,
+                callback_inputs=callback_on_step_end_tensor_inputs,
+            )
+
+            # 4. Decode the finite samples
+            images = self._decode(latents, arguments, report)
+        self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
 
-    def _generate(
-        self, settings: CallSettings, embeds: Tensor, noise_level: int, prompts: list[list[str] | Tensor],
-        report: RunReport, init: Tensor | None = None, wrap: Callable[[Network], Network] | None = None,
-    ) -> Any:  # fmt: skip
-        """Generates pictures from un-noised embeddings (B, D); see `_check_prompts` and `_denoise`."""
-        # 1. Encode the prompts
-        scale = (settings.cross_attention_kwargs or {}).get("scale", 1.0)
-        with report.stage("prompt"):
-            states = [one if isinstance(one, Tensor) else self.encode_prompt(one, scale) for one in prompts]
-            states = [one.to(settings.device).expand(len(embeds), -1, -1) for one in states]
-            hidden_states = torch.cat(states).repeat_interleave(settings.repeats, dim=0)
-        if all(isinstance(prompt, Tensor) for prompt in prompts):
-            report.left_out.append("prompt encoder")
+    # Checks -----------------------------------------------------------------------------------------------------------
 
-        # 2. Noise the embedding before latents are drawn, as diffusers does
-        embeds = embeds.to(settings.device, torch.float32)  # the noise must not depend on the dtype
-        generator, repeats = settings.generator, settings.repeats
-        if isinstance(generator, list):  # which draws noise for each image; a single one, for each embedding
-            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
-        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
-        level = torch.full((len(embeds),), noise_level, device=embeds.device)
-        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
-        labels = labels.repeat_interleave(repeats, dim=0)
-        if settings.guidance.active:
-            labels = torch.cat([torch.zeros_like(labels), labels])
+    def _check_arguments(self, **given: Any) -> SamplingArguments:
+        arguments = super()._check_arguments(**given)
+        if arguments.noise_level is not None:
+            top = self.image_noising_scheduler.config.num_train_timesteps - 1
+            check_integer("noise_level", arguments.noise_level, 0, top)
+        return arguments
 
-        # 3. Denoise, and decode the finite samples
-        latents = self._denoise(settings, hidden_states, labels, report, init, wrap=wrap)
-        images = self._images(settings, latents, report)
-        self.maybe_free_model_hooks()
-        return images
+    def _check_prompts(
+        self,
+        batch_size: int,
+        guidance: Guidance,
+        *,
+        prompt: str | list[str] | None,
+        prompt_embeds: Tensor | None,
+        negative_prompt: str | list[str] | None,
+        negative_prompt_embeds: Tensor | None,
+    ) -> list[list[str] | Tensor]:
+        """The prompts of each branch that runs, unconditional first: B texts, or hidden states (1 or B, T, C)."""
+        prompts = [self._check_prompt("prompt", prompt, prompt_embeds, QUALITY_PROMPT, batch_size)]
+        if guidance.active:
+            negative = self._check_prompt("negative_prompt", negative_prompt, negative_prompt_embeds, "", batch_size)
+            prompts.insert(0, negative)
+        lengths = {one.shape[1] if isinstance(one, Tensor) else self.tokenizer.model_max_length for one in prompts}
+        if len(lengths) > 1:
+            raise InvalidInputError(
+                f"`prompt_embeds` and `negative_prompt_embeds` have {sorted(lengths)} tokens; pass both, of one length."
+            )
+        return prompts
 
-    @runs_networks
+    def _check_prompt(
+        self, name: str, prompt: Any, embeds: Tensor | None, default: str, batch_size: int
+    ) -> list[str] | Tensor:
+        """The prompts of a branch, `default` if there is none; or the hidden states in their place."""
+        if embeds is not None:
+            check_unused(f"{name}_embeds", **{name: prompt})
+            check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
+            check_count(f"{name}_embeds", len(embeds), batch_size)
+            return embeds
+        if self.text_encoder is None or self.tokenizer is None:
+            raise InvalidInputError(f"`{name}` needs a text encoder, and there is none; pass `{name}_embeds`.")
+        texts = check_texts(name, default if prompt is None else prompt)
+        check_count(name, len(texts), batch_size)
+        return texts * batch_size if len(texts) == 1 else texts
+
+    # Encoding ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
     def encode_touch(
-        self, touch: ImageInput, sensor: SensorNames = None, strength: float | None = None,
-        background: ImageInput = None, bridge: bool | None = None,
-    ) -> Tensor:  # fmt: skip
+        self,
+        touch: ImageInput,
+        sensor: SensorNames = None,
+        strength: float | None = None,
+        background: ImageInput = None,
+        bridge: bool | None = None,
+    ) -> Tensor:
         """Un-noised embeddings (B, D) that condition the network; for arguments and errors see `__call__`."""
-        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
-        bridge = self._check_bridge(bridge)
-        touches = self._prepare_touch(touch, sensor, background)
-        return self._encode(touches, strength, bridge, RunReport())
+        strength = self.config.default_strength if strength is None else strength
+        arguments = self._check_arguments(strength=strength, bridge=bridge)
+        touches = self._read_touches(touch, sensor, background)
+        with self._threads(self._latents_shape(len(touches.pixels), arguments), Guidance(1.0)):
+            return self._encode(touches, arguments, RunReport())
 
-    def _encode(self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
+    def _encode(self, touches: Touches, arguments: SamplingArguments, report: RunReport) -> Tensor:
         """Embeddings (B, D) of touches, with bridge and strength."""
-        embeds = self._touch_embeds(touches, report, throw)
-        return strength * (self.embedding_bank.bridge(embeds) if bridge else embeds)
+        embeds = self._touch_embeds(touches, report, arguments.throw)
+        if arguments.bridge:
+            embeds = self.embedding_bank.bridge(embeds)
+        return arguments.strength * embeds
 
+    @torch.no_grad()
     def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
 
@@ -265,8 +371,11 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
-        prompts, device = check_texts("prompt", prompt), self._execution_device
         check_number("lora_scale", lora_scale, -MAX_SCALE, MAX_SCALE)
+        return self._encode_prompt(check_texts("prompt", prompt), lora_scale)
+
+    def _encode_prompt(self, prompts: list[str], lora_scale: float) -> Tensor:
+        device = self._execution_device
         scaled = lora_scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
         unique = list(dict.fromkeys(prompts))
         ids = tokenize(self.tokenizer, unique)
@@ -281,41 +390,42 @@ class TouchToImagePipeline(UniTouchPipeline):
                 unscale_lora_layers(self.text_encoder, lora_scale)
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
-    # Checks -----------------------------------------------------------------------------------------------------------
+    def _encode_prompts(
+        self,
+        prompts: list[list[str] | Tensor],
+        images: int,
+        cross_attention_kwargs: dict[str, Any] | None,
+        report: RunReport,
+    ) -> Tensor:
+        """Hidden states of the prompts of `_check_prompts`, with one row for each image and branch."""
+        lora_scale = (cross_attention_kwargs or {}).get("scale", 1.0)
+        device = self._execution_device
+        branches = []
+        with report.stage("prompt"):
+            for prompt in prompts:
+                states = prompt if isinstance(prompt, Tensor) else self._encode_prompt(prompt, lora_scale)
+                states = states.to(device, self.unet.dtype)
+                branches.append(states.repeat_interleave(images // len(states), dim=0))
+        if all(isinstance(prompt, Tensor) for prompt in prompts):
+            report.left_out.append("prompt encoder")
+        return torch.cat(branches)
 
-    def _check_noise_level(self, noise_level: int | None) -> int:
-        top = self.image_noising_scheduler.config.num_train_timesteps - 1
-        return check_integer("noise_level", self._default("noise_level", noise_level), 0, top)
-
-    def _check_prompts(
-        self, batch_size: int, guidance: Guidance, positive: tuple[Any, Any], negative: tuple[Any, Any]
-    ) -> list[list[str] | Tensor]:
-        """Prompts per branch that runs, unconditional first: B texts, or hidden states (1 or B, T, C).
-
-        Args:
-            positive, negative: Prompts, and hidden states that may replace them.
-        """
-        branches = [("prompt", *positive, QUALITY_PROMPT), ("negative_prompt", *negative, "")]
-        found, lengths = list[list[str] | Tensor](), set[int]()
-        for name, prompt, embeds, default in branches if guidance.active else branches[:1]:
-            if embeds is not None:
-                check_unused(f"{name}_embeds", **{name: prompt})
-                name = f"{name}_embeds"
-                given: Any = check_tensor(name, embeds, "B", "T", self.unet.config.cross_attention_dim)
-                lengths.add(given.shape[1])
-            elif self.text_encoder is None or self.tokenizer is None:
-                raise InvalidInputError(f"`{name}` needs a text encoder, and there is none; pass `{name}_embeds`.")
-            else:
-                given = check_texts(name, default if prompt is None else prompt)
-                given = given * batch_size if len(given) == 1 else given
-                lengths.add(self.tokenizer.model_max_length)
-            check_count(name, len(given), batch_size)
-            found.append(given)
-        if len(lengths) > 1:
-            raise InvalidInputError(
-                f"`prompt_embeds` and `negative_prompt_embeds` have {sorted(lengths)} tokens; pass both, of one length."
-            )
-        return found[::-1]
+    def _class_labels(
+        self, embeds: Tensor, arguments: SamplingArguments, guidance: Guidance, generator: Generators
+    ) -> Tensor:
+        """Class labels of each image and branch: noised embeddings, drawn before latents as in diffusers, or zeros."""
+        embeds = embeds.to(self._execution_device, torch.float32)  # the noise must not depend on the dtype
+        repeats = arguments.num_images_per_prompt
+        if isinstance(generator, list):  # which draws noise for each image; a single one, for each embedding
+            embeds = embeds.repeat_interleave(repeats, dim=0)
+            repeats = 1
+        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
+        level = torch.full((len(embeds),), arguments.noise_level, device=embeds.device)
+        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
+        labels = labels.repeat_interleave(repeats, dim=0)
+        if guidance.active:
+            labels = torch.cat([torch.zeros_like(labels), labels])
+        return labels.to(self.unet.dtype)
 
     # Building on other pipelines --------------------------------------------------------------------------------------
 
@@ -328,7 +438,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             kwargs: Components and defaults to replace, and `torch_dtype`; a missing `processor` is made for `unitouch`.
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
-        (modules, settings), dtype = cls._get_signature_keys(cls), kwargs.pop("torch_dtype", None)
+        modules, settings = cls._get_signature_keys(cls)
+        dtype = kwargs.pop("torch_dtype", None)
         available = {**pipeline.config, **pipeline.components}
         parts = {name: available[name] for name in (*modules, *settings) if name in available} | kwargs
         if parts.get("unitouch") is not None and parts.get("processor") is None:
@@ -352,10 +463,17 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     @classmethod
     def from_published(
-        cls, unclip: str | os.PathLike, unitouch: str | os.PathLike | UniTouchModel, *,
-        dtype: torch.dtype = torch.float32, variant: str | None = None, revision: str | None = None,
-        cache_dir: str | os.PathLike | None = None, token: str | bool | None = None, local_files_only: bool = False,
-    ) -> Self:  # fmt: skip
+        cls,
+        unclip: str | os.PathLike,
+        unitouch: str | os.PathLike | UniTouchModel,
+        *,
+        dtype: torch.dtype = torch.float32,
+        variant: str | None = None,
+        revision: str | None = None,
+        cache_dir: str | os.PathLike | None = None,
+        token: str | bool | None = None,
+        local_files_only: bool = False,
+    ) -> Self:
         """Builds on published weights: an unCLIP model and a converted joint space.
 
         Touches are rescaled to the norm of image embeddings that the unCLIP's normaliser tells of.
@@ -379,6 +497,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         source = read_unclip(unclip, model, dtype, variant, revision=revision, **hub)
         if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
             processor.tokenizer = source.tokenizer
-        mean, std = source.image_normalizer.mean.double(), source.image_normalizer.std.double()
+        mean = source.image_normalizer.mean.double()
+        std = source.image_normalizer.std.double()
         model.config.embedding_norm = (mean.square() + std.square()).sum().sqrt().item()  # RMS norm of embeddings
         return cls.from_pipe(source, unitouch=model, processor=processor)

@@ -21,12 +21,12 @@ from unitouch_gen.errors import (
     check_unused,
     did_you_mean,
     first_line,
-)  # fmt: skip
+)
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, runs_networks
+from unitouch_gen.pipelines.base import SensorNames, UniTouchPipeline, threads_for
 from unitouch_gen.pipelines.output import AnswerReport, TouchToTextPipelineOutput
 
 QUESTION = "{question}"  # where a template has it
@@ -48,19 +48,28 @@ class TouchToTextPipeline(UniTouchPipeline):
     model_cpu_offload_seq = "unitouch->language_model"
     _optional_components = ["unitouch", "processor"]
     _exclude_from_cpu_offload = ["unitouch", "language_bridge"]
-    _main_network, _task = "language_model", "image-to-text"
-    _example_call, _example_end = 'pipe(example("brick"), "How does it feel?")', "print(output.texts[0])"
+    _task = "image-to-text"
+    _example_call = 'pipe(example("brick"), "How does it feel?")'
+    _example_end = "print(output.texts[0])"
 
     def __init__(
-        self, language_bridge: LanguageBridge, language_model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase,
-        unitouch: UniTouchModel | None = None, processor: UniTouchProcessor | None = None,
+        self,
+        language_bridge: LanguageBridge,
+        language_model: PreTrainedModel,
+        tokenizer: PreTrainedTokenizerBase,
+        unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None,
         prompt_template: str = QUESTION,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.register_modules(
-            language_bridge=language_bridge, language_model=language_model, tokenizer=tokenizer, unitouch=unitouch,
+            language_bridge=language_bridge,
+            language_model=language_model,
+            tokenizer=tokenizer,
+            unitouch=unitouch,
             processor=processor,
-        )  # fmt: skip
+        )
+        self._weights = language_model.num_parameters()
         if QUESTION not in check_kind("prompt_template", prompt_template, str):
             raise InvalidInputError(f"`prompt_template` is {prompt_template!r}; it has to hold '{QUESTION}'.")
         self.register_to_config(prompt_template=prompt_template)
@@ -72,14 +81,20 @@ class TouchToTextPipeline(UniTouchPipeline):
         """D, width of the embeddings that the language bridge takes."""
         return self.language_bridge.config["embedding_dim"]
 
-    @runs_networks
+    @torch.no_grad()
     def __call__(
         self,
-        touch: ImageInput = None, question: str | list[str] | None = None, max_new_tokens: int | None = None,
-        sensor: SensorNames = None, background: ImageInput = None, image: ImageInput = None,
-        touch_embeds: Tensor | None = None, generator: torch.Generator | None = None, return_dict: bool = True,
+        touch: ImageInput = None,
+        question: str | list[str] | None = None,
+        max_new_tokens: int | None = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        image: ImageInput = None,
+        touch_embeds: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        return_dict: bool = True,
         **generate: Any,
-    ) -> TouchToTextPipelineOutput | tuple:  # fmt: skip
+    ) -> TouchToTextPipelineOutput | tuple:
         """Answers questions about touches. Other arguments, errors and warnings: see `TouchToImagePipeline.__call__`.
 
         Args:
@@ -96,36 +111,50 @@ class TouchToTextPipeline(UniTouchPipeline):
             >>> pipe("touch.png", "How does it feel?").texts  # doctest: +SKIP
         """
         # 1. Check inputs, before any network runs
-        given = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
-        inputs: Any
-        name, *others = [name for name, value in given.items() if value is not None] or [""]
-        if others or not name:
-            raise InvalidInputError("`touch`, `image` or `touch_embeds` has to be passed, one of them.")
+        self._check_device()
+        passed = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
+        names = [name for name, value in passed.items() if value is not None]
+        if len(names) != 1:
+            raise InvalidInputError("One of `touch`, `image` and `touch_embeds` has to be passed.")
+        (name,) = names
+        inputs: Any = touch_embeds  # touches, pixel values, or embeddings
         if name == "touch":
-            inputs = self._prepare_touch(touch, sensor, background)
+            inputs = self._read_touches(touch, sensor, background)
+            batch_size = len(inputs.pixels)
         else:
             check_unused(name, sensor=sensor, background=background)
-            inputs = touch_embeds if name == "touch_embeds" else self._joint(name) and self.processor.images(image)
-        if name == "touch_embeds":
-            check_tensor(name, inputs, "B", self.embedding_dim)
+            if name == "image":
+                self._joint("image")
+                inputs = self.processor.images(image)
+            else:
+                check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
+            batch_size = len(inputs)
         if generator is not None:
             check_kind("generator", generator, torch.Generator)
-        prompts = self._tokenize(question, len(inputs.pixels if name == "touch" else inputs))
+        prompts = self._tokenize(question, batch_size)
         config, options = self._check_options(prompts, max_new_tokens, generate)
-
-        # 2. Encode the touch
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
-        with report.stage(name):
-            embeds = self._encode(name, inputs, report)
 
-        # 3. Generate token ids, after prompts that are padded on the left
-        device, pad, width = self._execution_device, config.pad_token_id, max(report.prompt_tokens)
-        ids = torch.tensor([[pad] * (width - len(prompt)) + prompt for prompt in prompts], device=device)
-        mask = torch.tensor([[0] * (width - size) + [1] * size for size in report.prompt_tokens], device=device)
-        rows = embeds.expand(len(prompts), -1).to(device)
-        model, attach = self.language_model, self.language_bridge.attach
-        with report.stage("answer"), _ANSWERING, seeded(generator, device), attach(model, rows), usable(generate):
-            made = model.generate(ids, attention_mask=mask, generation_config=config, **options)
+        with threads_for(self._weights * sum(report.prompt_tokens)):
+            # 2. Encode the touch
+            with report.stage(name):
+                embeds = self._encode(name, inputs, report)
+
+            # 3. Generate token ids, after prompts that are padded on the left
+            device = self._execution_device
+            pad = config.pad_token_id
+            width = max(report.prompt_tokens)
+            ids = torch.tensor([[pad] * (width - len(prompt)) + prompt for prompt in prompts], device=device)
+            mask = torch.tensor([[0] * (width - size) + [1] * size for size in report.prompt_tokens], device=device)
+            rows = embeds.expand(len(prompts), -1).to(device)
+            with (
+                report.stage("answer"),
+                _ANSWERING,
+                seeded(generator, device),
+                self.language_bridge.attach(self.language_model, rows),
+                option_errors(generate),
+            ):
+                made = self.language_model.generate(ids, attention_mask=mask, generation_config=config, **options)
 
         # 4. Decode them
         answers = getattr(made, "sequences", made)[:, width:]
@@ -135,16 +164,21 @@ class TouchToTextPipeline(UniTouchPipeline):
         self.maybe_free_model_hooks()
         return TouchToTextPipelineOutput(texts, report, embeds) if return_dict else (texts, report)
 
-    @runs_networks
+    @torch.no_grad()
     def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        return self._encode("touch", self._prepare_touch(touch, sensor, background), AnswerReport())
+        self._check_device()
+        touches = self._read_touches(touch, sensor, background)
+        with threads_for(self._weights * len(touches.pixels)):
+            return self._encode("touch", touches, AnswerReport())
 
     def _encode(self, name: str, inputs: Any, report: AnswerReport) -> Tensor:
         """Embeddings (B, D) of touches, of photos, or as they were passed."""
         if name == "touch":
             return self._touch_embeds(inputs, report)
-        return self._match_norm(self.unitouch.get_image_features(inputs), name) if name == "image" else inputs
+        if name == "image":
+            return self._match_norm(self.unitouch.get_image_features(inputs), "image")
+        return inputs
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
@@ -163,7 +197,9 @@ class TouchToTextPipeline(UniTouchPipeline):
 
     def _check_options(self, prompts: list[list[int]], most: int | None, given: dict[str, Any]) -> tuple[Any, dict]:
         """The configuration of `generate`, with at most `most` new tokens, and its other options."""
-        longest, model, tokenizer = max(map(len, prompts)), self.language_model, self.tokenizer
+        longest = max(map(len, prompts))
+        model = self.language_model
+        tokenizer = self.tokenizer
         free = (getattr(model.config.get_text_config(), "max_position_embeddings", None) or 10**9) - longest
         if free < 1:
             raise InvalidInputError(f"`question` has {longest} tokens, too many for the language model; shorten it.")
@@ -176,7 +212,7 @@ class TouchToTextPipeline(UniTouchPipeline):
             raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
         for name in ("num_beams", "num_return_sequences"):
             check_integer(name, given.get(name, 1), 1)
-        with usable(given):
+        with option_errors(given):
             others = config.update(**given)
         ends = tokenizer.eos_token_id if config.eos_token_id is None else config.eos_token_id
         config.eos_token_id = ends if isinstance(ends, list) else [ends]
@@ -186,8 +222,8 @@ class TouchToTextPipeline(UniTouchPipeline):
 
 
 @contextmanager
-def usable(options: dict[str, Any]) -> Iterator[None]:
-    """Tells what transformers says of options that `generate` cannot use."""
+def option_errors(options: dict[str, Any]) -> Iterator[None]:
+    """Re-raises option errors of `generate`."""
     try:
         yield
     except (ValueError, TypeError, AttributeError) as error:

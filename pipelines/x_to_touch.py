@@ -9,6 +9,7 @@ from diffusers import AutoencoderKL, AutoencoderTiny, UNet2DConditionModel, VQMo
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from torch import Tensor
 
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
@@ -27,17 +28,15 @@ from unitouch_gen.pipelines.base import (
     Generators,
     SensorNames,
     StepEndCallback,
-    Touches,
     UniTouchPipeline,
     check_count,
     check_weights,
-    runs_networks,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.sampling import RunReport
+from unitouch_gen.sampling import Denoiser, Guidance, RunReport, prepare_steps
 
 ALL = "all"  # in place of a sensor's name: every known sensor
-Conditions = dict[str, tuple[float, Any]]  # by modality: weight > 0, and inputs (1 or B)
+Conditions = dict[str, tuple[float, Any]]  # by modality: weight > 0, and `Touches` or arguments of its encoder
 
 
 class XToTouchPipeline(UniTouchPipeline):
@@ -66,27 +65,38 @@ class XToTouchPipeline(UniTouchPipeline):
     _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "backgrounds"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _example_call = 'pipe(image=example("brick", "image"))'
-    _hidden_states_name = "condition_embeds"
 
     def __init__(
-        self, unet: UNet2DConditionModel, scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny | VQModel, unitouch: UniTouchModel | None = None,
-        processor: UniTouchProcessor | None = None, embedding_bank: EmbeddingBank | None = None,
+        self,
+        unet: UNet2DConditionModel,
+        scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderTiny | VQModel,
+        unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None,
+        embedding_bank: EmbeddingBank | None = None,
         backgrounds: SensorBackgrounds | None = None,
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of other annotations
-        default_guidance_scale: float = 7.5, default_num_inference_steps: int = 200,
+        default_guidance_scale: float = 7.5,
+        default_num_inference_steps: int = 200,
         default_timesteps: list[int] | None = None,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.register_modules(
-            unitouch=unitouch, processor=processor, embedding_bank=embedding_bank, backgrounds=backgrounds, unet=unet,
-            scheduler=scheduler, vae=vae,
-        )  # fmt: skip
+            unitouch=unitouch,
+            processor=processor,
+            embedding_bank=embedding_bank,
+            backgrounds=backgrounds,
+            unet=unet,
+            scheduler=scheduler,
+            vae=vae,
+        )
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
-            "`unet`", default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps, default_timesteps=default_timesteps,
-        )  # fmt: skip
+            "`unet`",
+            default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps,
+            default_timesteps=default_timesteps,
+        )
         if unet.config.class_embed_type is not None:
             kind = unet.config.class_embed_type
             raise InvalidInputError(f"`unet` takes class labels of the kind {kind!r}, as unCLIP's.")
@@ -107,48 +117,40 @@ class XToTouchPipeline(UniTouchPipeline):
         """Whether the UNet takes background latents as input channels; it then draws unnamed sensors, too."""
         return self.unet.config.in_channels != self.unet.config.out_channels
 
-    # Conditions -------------------------------------------------------------------------------------------------------
-
-    @runs_networks
-    def encode_condition(
-        self, image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,
-        touch: ImageInput = None, *, weights: Mapping[str, float] | None = None, bridge: bool | None = None,
-        source_sensor: SensorNames = None,
-    ) -> Tensor:  # fmt: skip
-        """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
-        bridge = self._check_bridge(bridge)
-        given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions, _ = self._prepare(given, weights, source_sensor)
-        return self._condition(conditions, bridge, RunReport())
-
-    def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
-        """(B, 1, D) of the joint space's norm."""
-        mixed: Any = 0.0
-        for name, (weight, inputs) in conditions.items():
-            if name == "touch":
-                embeds = self._touch_embeds(inputs, report, throw)
-            else:
-                embeds = self._match_norm(getattr(self.unitouch, f"get_{name}_features")(**inputs), name, throw)
-            mixed = mixed + weight * (self.embedding_bank.bridge(embeds) if bridge and name != "image" else embeds)
-        return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
-
     # One call ---------------------------------------------------------------------------------------------------------
 
-    @runs_networks
+    @torch.no_grad()
     def __call__(
         self,
-        image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,
-        touch: ImageInput = None, sensor: SensorNames = None, background: ImageInput = None,
-        weights: Mapping[str, float] | None = None, bridge: bool | None = None,
-        height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None, guidance_scale: float | None = None,
-        num_images_per_prompt: int = 1, source_sensor: SensorNames = None,
-        solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
-        generator: Generators = None, latents: Tensor | None = None, condition_embeds: Tensor | None = None,
-        output_type: str = "pil", return_dict: bool = True,
-        cross_attention_kwargs: dict[str, Any] | None = None, callback_on_step_end: StepEndCallback | None = None,
-        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",), throw: bool = True,
-    ) -> UniTouchPipelineOutput | tuple:  # fmt: skip
+        image: ImageInput = None,
+        text: str | list[str] | None = None,
+        audio: AudioInput = None,
+        touch: ImageInput = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        weights: Mapping[str, float] | None = None,
+        bridge: bool | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None,
+        guidance_scale: float | None = None,
+        num_images_per_prompt: int = 1,
+        source_sensor: SensorNames = None,
+        solver: str | None = None,
+        tolerance: float | None = None,
+        max_evaluations: int | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        condition_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
         """Generates touch images.
 
         The other arguments, the output, errors and warnings are those of `TouchToImagePipeline.__call__`.
@@ -182,98 +184,192 @@ class XToTouchPipeline(UniTouchPipeline):
             >>> pipe(image="wall.jpg").images[0].save("wall.png")
         """
         # 1. Check inputs, before any network runs
-        given = {"image": image, "text": text, "audio": audio, "touch": touch}
+        arguments = self._check_arguments(
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            timesteps=timesteps,
+            guidance_scale=guidance_scale,
+            num_images_per_prompt=num_images_per_prompt,
+            bridge=bridge,
+            solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            output_type=output_type,
+            throw=throw,
+        )
+        modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions: Conditions = {}
         if condition_embeds is None:
-            bridge = self._check_bridge(bridge)
-            conditions, inputs = self._prepare(given, weights, source_sensor)
+            conditions, inputs = self._read_conditions(modalities, weights, source_sensor)
         else:
-            embeds = check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
-            given |= {"weights": weights, "source_sensor": source_sensor}
-            check_unused("condition_embeds", **given, bridge=bridge or None)
-            inputs = len(embeds)
-        gels, sensor_labels = self._check_sensor(sensor, background, inputs)
-        batch_size = len(sensor_labels)
-        settings = self._check_call(
-            batch_size, num_images_per_prompt, height, width, num_inference_steps, guidance_scale, solver, tolerance,
-            max_evaluations, eta, generator, latents, output_type, cross_attention_kwargs, callback_on_step_end,
-            callback_on_step_end_tensor_inputs, throw, timesteps=timesteps,
-        )  # fmt: skip
+            check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
+            others = {**modalities, "weights": weights, "source_sensor": source_sensor, "bridge": bridge or None}
+            check_unused("condition_embeds", **others)
+            inputs = len(condition_embeds)
+        backgrounds, sensors = self._read_sensors(sensor, background, inputs)
+        batch_size = len(sensors)
+        shape = self._latents_shape(batch_size, arguments)
+        guidance = Guidance(arguments.guidance_scale)
+        self.check_inputs(
+            shape,
+            arguments,
+            generator=generator,
+            latents=latents,
+            cross_attention_kwargs=cross_attention_kwargs,
+            callback_on_step_end=callback_on_step_end,
+            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
+        )
+        steps, schedule = prepare_steps(self.scheduler, arguments, self._execution_device)
+        report = RunReport(left_out=[f"{name} encoder" for name in MODALITIES if name not in conditions])
 
-        # 2. Encode the condition
-        report = RunReport()
-        report.left_out += [f"{name} encoder" for name in MODALITIES if name not in conditions]
-        if conditions:
-            with report.stage("condition"):
-                embeds = self._condition(conditions, bool(bridge), report, throw)
-        embeds = embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden_states = embeds.repeat_interleave(settings.repeats, dim=0)
-        labels = torch.tensor(sensor_labels).repeat_interleave(settings.repeats) if self.config.sensors else None
-        extra_channels = None
-        if gels:
-            latents_of_gels = self._encode_pictures("background", gels, settings)
-            extra_channels = latents_of_gels.repeat_interleave(settings.shape[0] // len(gels), dim=0)
-        elif self.takes_background:  # those stored with the checkpoint
-            stored = self.backgrounds.latents.float()[labels].to(settings.device)
-            extra_channels = F.interpolate(stored, settings.shape[-2:], mode="bilinear")
-        if settings.guidance.active:  # the unconditional token is zeros
-            hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])
-            labels = None if labels is None else torch.cat([labels, labels])
+        images = arguments.num_images_per_prompt
+        with self._threads(shape, guidance):
+            # 2. Encode the condition and the background
+            embeds: Any = condition_embeds
+            if conditions:
+                with report.stage("condition"):
+                    embeds = self._encode(conditions, arguments, report)
+            embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
+            hidden_states = embeds.to(self.unet.dtype).repeat_interleave(images, dim=0)
+            labels = torch.tensor(sensors, device=self._execution_device).repeat_interleave(images)
+            concat = self._background_latents(backgrounds, labels, shape) if self.takes_background else None
+            if guidance.active:  # the unconditional token is zeros
+                hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])
+                labels = torch.cat([labels, labels])
+            unet_conditions = {
+                "encoder_hidden_states": hidden_states,
+                "class_labels": labels if self.config.sensors else None,
+                "cross_attention_kwargs": cross_attention_kwargs,
+            }
 
-        # 3. Denoise, and decode the finite samples
-        result = self._denoise(settings, hidden_states, labels, report, extra_channels=extra_channels)
-        images = self._images(settings, result, report)
+            # 3. Denoise
+            noise = self.prepare_latents(shape, steps, generator, latents)
+            latents = self._denoise(
+                Denoiser(self.unet, schedule, unet_conditions, guidance, concat=concat),
+                noise,
+                steps,
+                arguments,
+                report,
+                generator=generator,
+                callback=callback_on_step_end,
+                callback_inputs=callback_on_step_end_tensor_inputs,
+            )
+
+            # 4. Decode the finite samples
+            images = self._decode(latents, arguments, report)
         self.maybe_free_model_hooks()
-        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
+        if not return_dict:
+            return images, report
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
+
+    # Encoding ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def encode_condition(
+        self,
+        image: ImageInput = None,
+        text: str | list[str] | None = None,
+        audio: AudioInput = None,
+        touch: ImageInput = None,
+        *,
+        weights: Mapping[str, float] | None = None,
+        bridge: bool | None = None,
+        source_sensor: SensorNames = None,
+    ) -> Tensor:
+        """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
+        arguments = self._check_arguments(bridge=bridge)
+        modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
+        conditions, inputs = self._read_conditions(modalities, weights, source_sensor)
+        with self._threads(self._latents_shape(inputs, arguments), Guidance(1.0)):
+            return self._encode(conditions, arguments, RunReport())
+
+    def _encode(self, conditions: Conditions, arguments: SamplingArguments, report: RunReport) -> Tensor:
+        """The mix of conditions, (B, 1, D), at the norm of the joint space's images."""
+        model = self.unitouch
+        encoders = {
+            "image": model.get_image_features,
+            "text": model.get_text_features,
+            "audio": model.get_audio_features,
+        }
+        mixed: Any = 0.0
+        for modality, (weight, inputs) in conditions.items():
+            if modality == "touch":
+                embeds = self._touch_embeds(inputs, report, arguments.throw)
+            else:
+                embeds = self._match_norm(encoders[modality](**inputs), modality, arguments.throw)
+            if arguments.bridge and modality != "image":
+                embeds = self.embedding_bank.bridge(embeds)
+            mixed = mixed + weight * embeds
+        return match_norm(mixed, model.config.embedding_norm)[:, None]
+
+    def _background_latents(self, backgrounds: list[Tensor], labels: Tensor, shape: Sequence[int]) -> Tensor:
+        """Latents (B n, C, h, w) of pictures of untouched sensors, or those stored with the checkpoint."""
+        if backgrounds:
+            encoded = self._encode_pictures(backgrounds, shape)
+            return encoded.repeat_interleave(shape[0] // len(backgrounds), dim=0)
+        stored = self.backgrounds.latents.float().to(labels.device)[labels]
+        return F.interpolate(stored, shape[-2:], mode="bilinear")
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
-    def _prepare(
-        self, given: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
+    def _read_conditions(
+        self, modalities: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
     ) -> tuple[Conditions, int]:
-        """Reads the given modalities; also returns the number of inputs, B."""
-        given = {name: value for name, value in given.items() if value is not None}
-        if not given:
-            raise InvalidInputError("No input was given; pass `image`, `text`, `audio`, `touch` or `condition_embeds`.")
-        self._joint(next(iter(given)))
-        if source_sensor is not None and "touch" not in given:
+        """The modalities that were passed, read, with their weights; and the number of inputs, B."""
+        modalities = {name: value for name, value in modalities.items() if value is not None}
+        if not modalities:
+            raise InvalidInputError(
+                "No input was passed; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
+            )
+        self._joint(next(iter(modalities)))
+        if source_sensor is not None and "touch" not in modalities:
             raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
         inputs: dict[str, Any] = {}
-        if "image" in given:
-            inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
-        if "text" in given:
-            for number, text in enumerate(check_texts("text", given["text"])):
+        sizes: dict[str, int] = {}
+        if "image" in modalities:
+            inputs["image"] = {"pixel_values": self.processor.images(modalities["image"])}
+            sizes["image"] = len(inputs["image"]["pixel_values"])
+        if "text" in modalities:
+            for number, text in enumerate(check_texts("text", modalities["text"])):
                 if not text.strip():
                     raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
-            inputs["text"] = dict(self.processor.text(given["text"]))
-        if "audio" in given:
-            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], audible=True)}
-        if "touch" in given:
-            inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
-        sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]
-        for name, size in zip(inputs, sizes, strict=True):
-            check_count(name, size, max(sizes))
-        weights = dict.fromkeys(given, 1.0) if weights is None else weights
-        if set(check_kind("weights", weights, Mapping)) != set(given):
+            inputs["text"] = self.processor.text(modalities["text"])
+            sizes["text"] = len(inputs["text"]["input_ids"])
+        if "audio" in modalities:
+            inputs["audio"] = {"input_values": self.processor.sounds(modalities["audio"], audible=True)}
+            sizes["audio"] = len(inputs["audio"]["input_values"])
+        if "touch" in modalities:
+            inputs["touch"] = self._read_touches(modalities["touch"], source_sensor)
+            sizes["touch"] = len(inputs["touch"].pixels)
+        batch_size = max(sizes.values())
+        for name, size in sizes.items():
+            check_count(name, size, batch_size)
+        weights = dict.fromkeys(modalities, 1.0) if weights is None else weights
+        if set(check_kind("weights", weights, Mapping)) != set(modalities):
             named = ", ".join(map(str, weights))
-            raise InvalidInputError(f"`weights` is of {named}, but {', '.join(given)} was given; weigh each of those.")
-        shares = check_weights("weights", [weights[name] for name in given])
-        return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
+            passed = ", ".join(modalities)
+            raise InvalidInputError(f"`weights` is of {named}, but {passed} was passed; weigh each of those.")
+        shares = check_weights("weights", [weights[name] for name in inputs])
+        conditions = {name: (share, inputs[name]) for name, share in zip(inputs, shares, strict=True) if share > 0}
+        return conditions, batch_size
 
-    def _check_sensor(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
-        """Given images of untouched gels, and the sensor label of each touch image, input by input.
+    def _read_sensors(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
+        """Pictures of untouched sensors that were passed, and the sensor label of each touch image, input by input.
 
-        Labels are indices in `config.sensors`; default 0. With images of gels it is one past the last.
+        Labels are indices in `config.sensors`; default 0. With pictures it is one past the last.
         """
-        names, gels = list(self.config.sensors), list[Tensor]()
+        names = list(self.config.sensors)
+        pictures: list[Tensor] = []
         if background is not None:
             if not self.takes_background:
                 raise InvalidInputError("`background` was given, but this model takes none; leave it out.")
             check_unused("background", sensor=sensor)  # a named sensor has its own
-            gels = load_images("background", background)
-            labels = [len(names)] * len(gels)
+            pictures = load_images("background", background)
+            labels = [len(names)] * len(pictures)
         elif not names and self.takes_background:
-            raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
+            raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its picture.")
         elif isinstance(sensor, str) and sensor == ALL:
             return [], list(range(max(len(names), 1))) * inputs
         elif not names:
@@ -287,4 +383,4 @@ class XToTouchPipeline(UniTouchPipeline):
         if not labels or (inputs > 1 and len(labels) not in (1, inputs)):
             name = "sensor" if background is None else "background"
             raise InvalidInputError(f"`{name}` holds {len(labels)} for {inputs} inputs; pass one, or one each.")
-        return gels, labels * inputs if len(labels) == 1 else labels
+        return pictures, labels * inputs if len(labels) == 1 else labels

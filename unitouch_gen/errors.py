@@ -14,12 +14,15 @@ from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from unitouch_gen.streams import open_standard_streams
 
 if TYPE_CHECKING:  # importing torch takes seconds, and the command line checks its arguments before
     import torch
+    from pydantic import BaseModel
+
+    Model = TypeVar("Model", bound=BaseModel)
 
 
 class InvalidInputError(ValueError):
@@ -161,6 +164,28 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     if not fits:
         raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be a number from {low:g} to {high:g}.")
     return float(value)
+
+
+def plain_integer(value: Any) -> Any:
+    """An integer of any library as an int; any other value as it is."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
+
+
+def check_fields(model: "type[Model]", **values: Any) -> "Model":
+    """Values as a pydantic model; raises on the first that is of a wrong kind or out of bounds."""
+    from pydantic import ValidationError
+
+    try:
+        return model(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        wanted = first["msg"].replace("Input should", "it has to")
+        wanted = wanted.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
+        choices = re.findall(r"'([^']*)'", str(first.get("ctx", {}).get("expected", "")))
+        message = f"`{name}` is {describe(values[name])}; {wanted}. {did_you_mean(values[name], choices)}".strip()
+        wrong_kind = first["type"].endswith("_type")
+        raise (InvalidTypeError if wrong_kind else InvalidInputError)(message) from error
 
 
 def check_texts(name: str, value: Any) -> list[str]:

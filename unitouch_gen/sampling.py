@@ -1,14 +1,14 @@
-"""From noise to latents: the steps of a call, guidance, the run, and the report of what it did.
+"""Sampling: the steps of a call, the denoiser with its guidance, and the report of what the call did.
 
-`prepare_steps` validates the step arguments; `sample` runs the steps: of a named solver or adaptive (see `solvers`), or
-of the pipeline's own diffusers scheduler in diffusers' loop. The state is float32 whatever the network's dtype.
+`prepare_steps` chooses the steps. A named solver or adaptive steps (see `solvers`) run a `Denoiser` by `solve`; the
+pipeline's own diffusers scheduler runs in the loop of `pipelines.base`. The state is float32 whatever the network's
+dtype.
 """
 
 import copy
 import inspect
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
@@ -19,6 +19,7 @@ from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.errors import (
     InvalidInputError,
     NonFiniteError,
@@ -26,13 +27,11 @@ from unitouch_gen.errors import (
     check_choice,
     check_integer,
     check_kind,
-    check_number,
-    check_tensor,
     check_unused,
     describe,
 )
-from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
-from unitouch_gen.solvers import SOLVERS, sample_adaptive
+from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised, to_prediction
+from unitouch_gen.solvers import DIVERGED_RMS, SOLVERS, Callback, sample_adaptive
 
 # Report ---------------------------------------------------------------------------------------------------------------
 
@@ -44,7 +43,8 @@ class ReturnCode(StrEnum):
 
     def __new__(cls, value: str, message: str) -> "ReturnCode":
         code = str.__new__(cls, value)
-        code._value_, code.message = value, message
+        code._value_ = value
+        code.message = message
         return code
 
     SUCCESS = "success", "The sample is finite."
@@ -109,118 +109,102 @@ class RunReport:
 # Steps ----------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """How a run goes from noise to latents; made by `prepare_steps`."""
-
-    solver: str  # a name in `SOLVERS`, "adaptive", or the class of `scheduler`
-    count: int = 0  # number of steps; 0 with a tolerance (chosen during the run)
-    sigmas: Sequence[float] = ()  # noise levels of a named solver, ending in 0; with a tolerance only the first
-    schedule: Any = None  # the network's `NoiseSchedule`; None with `scheduler`
-    prediction_type: str = ""
-    scheduler: Any = None  # a diffusers scheduler with its timesteps set
-    timesteps: Any = ()  # scheduler timesteps to run, (n,)
-    tolerance: float | None = None
-    max_evaluations: int | None = None
-    eta: float = 0.0
-
-
 def prepare_steps(
-    scheduler: SchedulerMixin, *, solver: str | None = None, num_inference_steps: int | None = None,
-    timesteps: Sequence[int] | None = None, tolerance: float | None = None, max_evaluations: int | None = None,
-    eta: float = 0.0, init_strength: float = 1.0, device: torch.device | str = "cpu",
-) -> Steps:  # fmt: skip
-    """Validates the step arguments of a call, before any network runs.
+    scheduler: Any, arguments: SamplingArguments, device: torch.device | str = "cpu"
+) -> tuple[Any, NoiseSchedule | None]:
+    """The steps of a call and, where they are noise levels, the schedule of the network; before any network runs.
 
-    Steps are given by one of three: `num_inference_steps` (default 50); `timesteps` of `scheduler`; or `tolerance`, a
-    relative RMS error of the latents from 1e-5 to 1. Without `solver` and `tolerance` a copy of the scheduler runs;
-    otherwise only its noise levels and prediction type are used. `max_evaluations` (default 1000) is of a tolerance,
-    `eta` of DDIM. `init_strength` (img2img) is the share of the steps to run. The first of them is at that share of the
-    spacing of the solver or scheduler, which goes from data (0) to noise (1). Raises `InvalidInputError` or
-    `InvalidTypeError` if steps are impossible or arguments exclude each other.
+    Steps are chosen by one of three arguments: `num_inference_steps` (default 50), `timesteps` of the scheduler, or a
+    `tolerance`. `init_strength` (img2img) is the share of the steps to run. The first of them is at that share of the
+    spacing of the solver or scheduler, which goes from data (0) to noise (1).
+
+    Returns:
+        With a `solver`, its falling noise levels, ending in 0. With a `tolerance`, the first and the last noise level.
+        Otherwise a copy of the scheduler with its timesteps set, and `None`.
+
+    Raises:
+        InvalidInputError: If the steps are impossible, or arguments exclude each other.
     """
-    config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
-    check_number("eta", eta, 0.0, 1.0)
-    check_number("init_strength", init_strength, 0.0, 1.0)
-    if tolerance is not None:
-        given = {"num_inference_steps": num_inference_steps, "timesteps": timesteps, "solver": solver}
-        check_unused("tolerance", **given, eta=eta or None)
-        check_number("tolerance", tolerance, 1e-5, 1.0)
-        limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
-        schedule, prediction_type = trained_for(scheduler)
-        start = schedule.karras_level(1.0 - init_strength)
-        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
-    if max_evaluations is not None:
-        raise InvalidInputError(f"`max_evaluations` is {describe(max_evaluations)}; it needs a `tolerance`.")
-    if timesteps is not None:
-        check_unused("timesteps", num_inference_steps=num_inference_steps, solver=solver)
-        check_kind("timesteps", timesteps, list, tuple)
-        falling = [check_integer("timesteps", one, 0, config.get("num_train_timesteps", 1000) - 1) for one in timesteps]
-        if not falling or falling != sorted(set(falling), reverse=True):
+    check_kind("scheduler", scheduler, SchedulerMixin)
+    steps = arguments.num_inference_steps
+    solver = arguments.solver
+    share = arguments.init_strength
+    if arguments.tolerance is not None:
+        others = {"num_inference_steps": steps, "timesteps": arguments.timesteps, "solver": solver}
+        check_unused("tolerance", **others, eta=arguments.eta or None)
+        schedule = NoiseSchedule.of(scheduler)
+        return [schedule.karras_level(1.0 - share), schedule.sigma_min], schedule
+    if arguments.max_evaluations is not None:
+        raise InvalidInputError(f"`max_evaluations` is {arguments.max_evaluations}; it applies only with `tolerance`.")
+    train_timesteps = scheduler.config.get("num_train_timesteps", 1000)
+    if arguments.timesteps is not None:
+        check_unused("timesteps", num_inference_steps=steps, solver=solver)
+        timesteps = [check_integer("timesteps", timestep, 0, train_timesteps - 1) for timestep in arguments.timesteps]
+        if not timesteps or timesteps != sorted(set(timesteps), reverse=True):
             raise InvalidInputError(f"`timesteps` is {describe(timesteps)}; each has to be below the one before.")
-        return prepare_scheduler(copy.deepcopy(scheduler), falling, eta, 1.0, device)
-    whole = 50 if num_inference_steps is None else num_inference_steps
-    check_integer("num_inference_steps", whole, 1, config.get("num_train_timesteps", 1000))
-    count = max(round(init_strength * whole), 1)
+        return prepare_scheduler(scheduler, timesteps, 1.0, device), None
+    steps = check_integer("num_inference_steps", 50 if steps is None else steps, 1, train_timesteps)
+    steps = max(round(share * steps), 1)
     if solver is None:
-        return prepare_scheduler(copy.deepcopy(scheduler), count, eta, init_strength, device)
-    schedule, prediction_type = trained_for(scheduler)
-    if check_choice("solver", solver, SOLVERS) != "ddim" and eta:
-        raise InvalidInputError(f"`eta` is {eta:g}, but {solver!r} adds no noise; pass solver='ddim', or leave it out.")
-    sigmas = [*SOLVERS[solver].spacing(schedule, count, init_strength), 0.0]
-    return Steps(solver, count, sigmas, schedule, prediction_type, eta=eta)
+        return prepare_scheduler(scheduler, steps, share, device), None
+    check_choice("solver", solver, SOLVERS)
+    if arguments.eta > 0.0 and not SOLVERS[solver].adds_noise:
+        raise InvalidInputError(f"`eta` is {arguments.eta:g}, but {solver!r} adds no noise; pass solver='ddim'.")
+    schedule = NoiseSchedule.of(scheduler)
+    return [*SOLVERS[solver].spacing(schedule, steps, share), 0.0], schedule
 
 
-def trained_for(scheduler: Any) -> tuple[NoiseSchedule, str]:
-    """The noise levels and the kind of prediction that a scheduler's network was trained for."""
-    schedule, prediction_type = NoiseSchedule.of(scheduler), scheduler.config.get("prediction_type")
-    return schedule, check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
-
-
-def prepare_scheduler(
-    scheduler: Any, steps: int | list[int], eta: float, init_strength: float, device: torch.device | str
-) -> Steps:
-    """Sets the timesteps of a diffusers scheduler, by their number or one by one."""
-    kind, known = type(scheduler).__name__, inspect.signature(scheduler.set_timesteps).parameters
-    name = "num_inference_steps" if isinstance(steps, int) else "timesteps"
-    words = f"`{name}` is {steps}"
-    options: dict[str, Any] = {name: steps, "device": device}
-    if name not in known:
-        raise InvalidInputError(f"{words}, but {kind} chooses its own; pass `num_inference_steps`.")
+def prepare_scheduler(scheduler: Any, steps: int | list[int], init_strength: float, device: torch.device | str) -> Any:
+    """A copy of a diffusers scheduler with its timesteps set, by their number or one by one."""
+    scheduler = copy.deepcopy(scheduler)
+    kind = type(scheduler).__name__
+    argument = "num_inference_steps" if isinstance(steps, int) else "timesteps"
+    options: dict[str, Any] = {argument: steps, "device": device}
+    parameters = inspect.signature(scheduler.set_timesteps).parameters
+    if argument not in parameters:
+        raise InvalidInputError(
+            f"`{argument}` is {steps}, but {kind} chooses its own; pass `num_inference_steps` instead."
+        )
     try:
-        if "strength" in known:  # as of LCM and TCD
+        if "strength" in parameters:  # of LCM and TCD
             options["strength"] = init_strength
         elif init_strength < 1.0:
-            scheduler = begun_within(scheduler, init_strength)
+            scheduler = truncate_schedule(scheduler, init_strength)
         scheduler.set_timesteps(**options)
     except (ValueError, IndexError, ZeroDivisionError) as error:
-        raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
-    first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
+        raise InvalidInputError(f"`{argument}` is {steps}, which {kind} cannot run: {error}") from error
+    first = float(scheduler.timesteps.max())
+    levels = scheduler.config.num_train_timesteps
     # "leading" spacing starts too low with 1 step, or too high with 1000
     if init_strength == 1.0 and not levels / 3 <= first < levels:
         raise InvalidInputError(
-            f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
+            f"`{argument}` is {steps}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or "
+            "name a `solver`."
         )
     if hasattr(scheduler, "set_begin_index"):
         scheduler.set_begin_index(0)  # without it diffusers starts at the second of two equal timesteps
-    count = scheduler.num_inference_steps if isinstance(steps, int) else len(steps)
-    return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps, eta=eta)
+    return scheduler
 
 
-def begun_within(scheduler: Any, share: float) -> Any:
+def truncate_schedule(scheduler: Any, share: float) -> Any:
     """A copy of a diffusers scheduler that starts at a share of its spacing: its higher noise levels are cut off."""
-    config, betas = scheduler.config, getattr(scheduler, "betas", None)
+    config = scheduler.config
+    betas = getattr(scheduler, "betas", None)
     if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
         raise ValueError(f"it starts at noise alone; pass no `init_strength`, which is {share:g}, or name a `solver`")
     scheduler.set_timesteps(100)
     spacing = scheduler.timesteps.unique()  # from the smallest
     levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)
-    own = {"num_train_timesteps": levels, "trained_betas": betas[:levels].tolist(), "timestep_spacing": "trailing",
-           "rescale_betas_zero_snr": False}  # fmt: skip
-    return type(scheduler).from_config(config, **{name: value for name, value in own.items() if name in config})
+    changes = {
+        "num_train_timesteps": levels,
+        "trained_betas": betas[:levels].tolist(),
+        "timestep_spacing": "trailing",
+        "rescale_betas_zero_snr": False,
+    }
+    return type(scheduler).from_config(config, **{name: value for name, value in changes.items() if name in config})
 
 
-# Guidance -------------------------------------------------------------------------------------------------------------
+# Denoising ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -231,8 +215,8 @@ class Guidance:
 
     @property
     def active(self) -> bool:
-        """Whether the unconditional branch is needed: scale > 1, or NaN (which a callback may set)."""
-        return not self.scale <= 1.0
+        """Whether the unconditional branch is needed: above a scale of 1."""
+        return self.scale > 1.0
 
     def combine(self, prediction: Tensor) -> Tensor:
         """(2 B, ...) unconditional and conditional predictions -> (B, ...)."""
@@ -240,167 +224,146 @@ class Guidance:
         return unconditional + self.scale * (conditional - unconditional)
 
 
-# Runs -----------------------------------------------------------------------------------------------------------------
-
-Network = Callable[[Tensor, Tensor], Tensor]
-"""(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
-
-OnStep = Callable[[int, Tensor, Tensor, "Run"], Tensor | None]
-
-DIVERGED_RMS = 10.0
-"""RMS of z above which a sample counts as diverged. Networks are trained at RMS 1. The built-in family in 20 steps
-reaches 1.3 at guidance 7.5, 7.4 at 100, and 10 to 24 at 1000."""
-
-
-class _EndedError(Exception):
-    """Ends a run before its last step, with a return code."""
-
-
-@torch.no_grad()
-def sample(
-    network: Network, noise: Tensor, steps: Steps, report: RunReport, *, guidance: Guidance = Guidance(1.0),
-    init: Tensor | None = None, generator: Any = None, throw: bool = True, on_step: OnStep | None = None,
-    progress: Callable[[float], object] = lambda share: None,
-) -> Tensor:  # fmt: skip
-    """From noise to latents, float32 (B, C, h, w). Non-finite samples are returned as zeros.
+class Denoiser:
+    """The denoiser D(x, sigma) of a UNet under its conditions, with guidance; it counts its evaluations.
 
     Args:
-        network: Denoising network with its conditioning bound; called on 2 B states while guidance is active.
-        noise: Unit-variance noise, (B, C, h, w).
-        report: Filled in: solver, numbers of steps and evaluations, and a return code for each sample.
-        init: Latents to start from, (B, C, h, w) (SDEdit; Meng et al., 2022).
-        generator: One, or one for each sample, for DDIM and schedulers that draw noise.
-        throw: Raise `NonFiniteError` or `NotConvergedError` where a sample fails; otherwise go on with the others.
-        on_step: Called as `on_step(step, timestep, latents, run)` after each step (diffusers schedulers: after each
-            evaluation). `latents` are variance-preserving (diffusers: in the scheduler's scale). It may return new
-            latents, and set `run.guidance` and `run.interrupted`.
-        progress: Called with the finished share of the run.
+        unet: Called as `unet(z, timestep, **conditions, return_dict=False)` with variance-preserving states; the first
+            item of what it returns is its prediction.
+        schedule: What the UNet was trained for. May be `None` where a scheduler alone calls `predict`.
+        conditions: Keyword arguments of the UNet. Tensors have B rows, or 2 B with the unconditional ones first.
+        guidance: A callback may exchange it during a run.
+        concat: Input channels beside the state, (B, C', h, w), the same in both branches.
+        edit: Changes the guided prediction of the clean latents x_0, (B, C, h, w).
     """
-    noise, init = noise.float(), None if init is None else init.float()
-    report.solver, report.codes = steps.solver, [ReturnCode.SUCCESS] * len(noise)
-    run = Run(network, steps, report, guidance, throw, on_step, progress, noise)
-    try:
-        latents = (run_solver if steps.scheduler is None else run_scheduler)(run, noise, init, generator)
-    except _EndedError as ended:
-        (code,) = ended.args
-        interrupted = code is ReturnCode.INTERRUPTED
-        if throw and not interrupted:  # an interruption is the user's own
-            raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}") from None
-        latents = run.zero_nonfinite(report.steps, run.latents if interrupted else run.denoised)
-        report.codes = [code if each is ReturnCode.SUCCESS else each for each in report.codes]
-    report.steps = steps.count or report.steps
-    return latents
 
+    def __init__(
+        self,
+        unet: Callable[..., Any],
+        schedule: NoiseSchedule | None,
+        conditions: Mapping[str, Any],
+        guidance: Guidance,
+        *,
+        concat: Tensor | None = None,
+        edit: Callable[[Tensor], Tensor] | None = None,
+    ):
+        self.unet = unet
+        self.schedule: Any = schedule
+        self.conditions = dict(conditions)
+        self.guidance = guidance
+        self.concat = concat
+        self.edit: Any = edit
+        self.dtype = getattr(unet, "dtype", torch.float32)
+        self.evaluations = 0  # calls of the UNet; with guidance one call holds both branches
+        self.guided = 0  # calls that held both branches
 
-def run_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
-    """diffusers' denoising loop, for any of its schedulers."""
-    scheduler, timesteps = copy.deepcopy(run.steps.scheduler), run.steps.timesteps
-    latents = noise * scheduler.init_noise_sigma
-    if init is not None:
-        latents = scheduler.add_noise(init, noise, timesteps[:1].expand(len(init)))
-    known = inspect.signature(scheduler.step).parameters
-    options = {"generator": generator, "eta": run.steps.eta}
-    options = {name: value for name, value in options.items() if name in known}
-    run.latents, z = latents, scheduler.scale_model_input(latents, timesteps[0])
-    for step, timestep in enumerate(timesteps):
-        latents = scheduler.step(run.predict(z, timestep), timestep, latents, **options, return_dict=False)[0]
-        latents = z = run.end_step(step, timestep, latents)
-        if step + 1 < len(timesteps):
-            z = scheduler.scale_model_input(latents, timesteps[step + 1])
-        run.mark_diverged(step, z)
-        run.progress((step + 1) / len(timesteps))
-    return latents
+    def __call__(self, x: Tensor, sigma: float) -> Tensor:
+        """D(x, sigma) of x = x_0 + sigma n, float32 (B, C, h, w), at the exact (fractional) timestep."""
+        z = x * alpha(sigma)
+        prediction = self.predict(z, self.timestep(sigma, x.device))
+        denoised = to_denoised(prediction, z, sigma, self.schedule.prediction_type)
+        return denoised if self.edit is None else self.edit(denoised)
 
-
-def run_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
-    """Runs a named solver, or adaptive steps."""
-    steps, sigma, codes = run.steps, run.steps.sigmas[0], run.report.codes
-    x = noise * math.hypot(1.0, sigma) if init is None else init + sigma * noise
-    run.latents, run.sigma = x * alpha(sigma), sigma
-    if steps.tolerance is not None:
-        ends, active = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
-        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, active)
-    options: dict[str, Any] = {}
-    if steps.solver == "ddim":
-        options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
-    return SOLVERS[steps.solver].sample(run.denoise, x, steps.sigmas, run.after_step, **options)
-
-
-@dataclass(eq=False)
-class Run:
-    """The state of one call of `sample`; callbacks may set `guidance` for the next evaluation, and `interrupted`."""
-
-    network: Network
-    steps: Steps
-    report: RunReport
-    guidance: Guidance
-    throw: bool
-    on_step: OnStep | None
-    progress: Callable[[float], object]
-    latents: Tensor  # after the last step, (B, C, h, w)
-    sigma: float = 0.0  # after the last step; unused by `run_scheduler`
-    denoised: Tensor = field(init=False)  # last D(x, sigma); the result of an unfinished adaptive run
-    interrupted: bool = False
+    def timestep(self, sigma: float, device: torch.device) -> Tensor:
+        """The timestep of a noise level, float32 (); it is made on the device, which nothing waits for."""
+        return torch.full((), self.schedule.timestep(sigma).item(), dtype=torch.float32, device=device)
 
     def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
-        """The guided prediction of the network (B, C, h, w)."""
-        if self.interrupted:
-            raise _EndedError(ReturnCode.INTERRUPTED)
-        if self.report.evaluations == self.steps.max_evaluations:
-            raise _EndedError(ReturnCode.MAX_EVALUATIONS)
+        """The guided prediction of the UNet at variance-preserving z, float32 (B, C, h, w), without `edit`."""
         guided = self.guidance.active
-        prediction = self.network(torch.cat([z] * 2) if guided else z, timestep).float()
-        self.report.evaluations += 1
-        self.report.guided += guided
+        state = torch.cat([z, z]) if guided else z
+        rows = len(state)
+        if self.concat is not None:
+            concat = torch.cat([self.concat, self.concat]) if guided else self.concat
+            state = torch.cat([state, concat.to(state)], dim=1)
+        conditions = {
+            name: value[-rows:] if isinstance(value, Tensor) else value for name, value in self.conditions.items()
+        }
+        prediction = self.unet(state.to(self.dtype), timestep, **conditions, return_dict=False)[0].float()
+        self.evaluations += 1
+        self.guided += guided
         return self.guidance.combine(prediction) if guided else prediction
 
-    def end_step(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
-        """Calls `on_step` with latents = `scale` * `state`, then zeros samples that are not finite."""
-        latents, self.report.steps = state * scale, step + 1
-        changed = None if self.on_step is None else self.on_step(step, timestep, latents, self)
-        if changed is not None:
-            changed = check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False).to(state)
-            if not torch.equal(changed, state * scale):  # `latents` itself may have been changed in place
-                state = changed / scale
-        state = self.zero_nonfinite(step, state)
-        self.latents = state * scale
-        return state
+    def edit_prediction(self, prediction: Tensor, z: Tensor, sigma: float) -> Tensor:
+        """A prediction (B, C, h, w) whose clean latents are the edited ones: what diffusers' schedulers step with."""
+        denoised = to_denoised(prediction, z, sigma, self.schedule.prediction_type)
+        return to_prediction(self.edit(denoised), z, sigma, self.schedule.prediction_type)
 
-    def zero_nonfinite(self, step: int, latents: Tensor) -> Tensor:
-        """Zeros samples that are or were non-finite; raises on a new one if `throw` is set."""
-        codes = self.report.codes
-        for row, finite in enumerate(latents.flatten(1).isfinite().all(dim=1).tolist()):
-            if codes[row].finite and not finite:
-                codes[row], self.report.failed_at[row] = ReturnCode.NON_FINITE, step
-                if self.throw:
-                    raise NonFiniteError(f"Sample {row} is not finite after step {step + 1}. {codes[row].message}")
-        failed = torch.tensor([not code.finite for code in codes], device=latents.device)
-        return latents.masked_fill(failed.view(-1, 1, 1, 1), 0.0)
 
-    def mark_diverged(self, step: int, z: Tensor) -> None:
-        """Marks samples whose RMS has just exceeded `DIVERGED_RMS`."""
-        for row, rms in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # inf where squares overflow
-            if rms > DIVERGED_RMS and self.report.codes[row] is ReturnCode.SUCCESS:
-                self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
+class RunInterruptedError(Exception):
+    """Raised by a callback to end a run of `solve`."""
 
-    # Called by solvers and by adaptive steps.
 
-    def denoise(self, x: Tensor, sigma: float) -> Tensor:
-        """D(x, sigma) of the network, evaluated at the exact (fractional) timestep."""
-        z = x * alpha(sigma)
-        self.denoised = to_denoised(self.predict(z, self.timestep(sigma)), z, sigma, self.steps.prediction_type)
-        return self.denoised
+def solve(
+    denoise: Denoiser,
+    x: Tensor,
+    sigmas: Sequence[float],
+    arguments: SamplingArguments,
+    callback: Callback,
+    generator: Any = None,
+) -> tuple[Tensor, ReturnCode]:
+    """Latents, float32 (B, C, h, w), by a named solver or to a tolerance, and how the run ended.
 
-    def timestep(self, sigma: float) -> Tensor:
-        return self.steps.schedule.timestep(sigma).to(self.latents.device, torch.float32)
+    Args:
+        x: Where to start, at the first noise level: x_0 + sigma n, (B, C, h, w).
+        sigmas: Noise levels of `prepare_steps`.
+        callback: Called as `callback(step, x, sigma)` after each step; returns the x to go on from.
+        generator: One, or one for each sample, for solvers that add noise.
+    """
+    if arguments.tolerance is not None:
+        limit = arguments.max_evaluations or 1000
+        x, finished = sample_adaptive(denoise, x, sigmas, arguments.tolerance, callback, max_evaluations=limit)
+        return x, ReturnCode.SUCCESS if finished else ReturnCode.MAX_EVALUATIONS
+    solver = SOLVERS[str(arguments.solver)]
+    options: dict[str, Any] = {}
+    if solver.adds_noise:
+        options["eta"] = arguments.eta
+        options["draw"] = lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)
+    return solver.sample(denoise, x, sigmas, callback, **options), ReturnCode.SUCCESS
 
-    def after_step(self, step: int, x: Tensor, sigma: float) -> Tensor:
-        """Solvers' `AfterStep`."""
-        x = self.end_step(step, self.timestep(self.sigma), x, alpha(sigma))
-        self.mark_diverged(step, self.latents)
-        self.sigma, first, last = sigma, self.steps.sigmas[0], self.steps.schedule.sigma_min
-        if self.steps.tolerance is None:
-            self.progress((step + 1) / self.steps.count)
-        else:
-            self.progress(1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last))
-        return x
+
+NEVER = 2**31
+
+
+class SampleStatus:
+    """Which samples became non-finite or diverged, and after which step; kept on their device, and read once.
+
+    A sample has diverged once the RMS of its variance-preserving state is above `DIVERGED_RMS`.
+    """
+
+    def __init__(self, samples: int, device: torch.device | str):
+        self.non_finite_at = torch.full((samples,), NEVER, device=device)
+        self.diverged_at = torch.full((samples,), NEVER, device=device)
+
+    def update(self, step: int, z: Tensor) -> None:
+        """Notes the samples of variance-preserving z (B, C, h, w) that a step, from 0, has broken."""
+        values = z.flatten(1)
+        non_finite = ~values.isfinite().all(dim=1)
+        diverged = values.square().mean(dim=1).sqrt() > DIVERGED_RMS
+        self.non_finite_at = torch.where(non_finite, self.non_finite_at.clamp(max=step), self.non_finite_at)
+        self.diverged_at = torch.where(diverged, self.diverged_at.clamp(max=step), self.diverged_at)
+
+    def conclude(self, report: RunReport, denoise: Denoiser, ended: ReturnCode, throw: bool) -> None:
+        """Writes counts and return codes into the report of a run, `ended` for samples that are well.
+
+        Raises:
+            NonFiniteError: If a sample is not finite and `throw` is set.
+            NotConvergedError: If the run ended by MAX_EVALUATIONS and `throw` is set.
+        """
+        report.evaluations = denoise.evaluations
+        report.guided = denoise.guided
+        report.codes = []
+        non_finite, diverged = torch.stack([self.non_finite_at, self.diverged_at]).tolist()
+        for row, (broken, large) in enumerate(zip(non_finite, diverged, strict=True)):
+            code = ended
+            if broken < NEVER:
+                code = ReturnCode.NON_FINITE
+                report.failed_at[row] = broken
+            elif large < NEVER:
+                code = ReturnCode.DIVERGED
+                report.failed_at[row] = large
+            report.codes.append(code)
+            if throw and code is ReturnCode.NON_FINITE:
+                raise NonFiniteError(f"Sample {row} is not finite after step {broken + 1}. {code.message}")
+        if throw and ended is ReturnCode.MAX_EVALUATIONS:
+            raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {ended.message}")

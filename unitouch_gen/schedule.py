@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_choice
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
 """As diffusers' schedulers call them."""
@@ -24,9 +24,13 @@ TRAINED = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "tr
 
 @dataclass(frozen=True, eq=False)
 class NoiseSchedule:
-    """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates."""
+    """Noise levels that a network was trained at, and what it predicts there.
+
+    Between training levels it is linear in log sigma, as diffusers interpolates.
+    """
 
     log_sigmas: Tensor  # of the T training levels, increasing, float64 (T,)
+    prediction_type: str  # one of `PREDICTION_TYPES`
 
     @classmethod
     def of(cls, scheduler: Any) -> "NoiseSchedule":
@@ -46,7 +50,8 @@ class NoiseSchedule:
                 f"`scheduler` is {name} with {len(log_sigmas)} noise levels that do not rise in float32; take at least "
                 "two, no `beta` under 1e-6, and all noise at the last one at the earliest."
             )
-        return cls(log_sigmas)
+        prediction_type = scheduler.config.get("prediction_type")
+        return cls(log_sigmas, check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES))
 
     @property
     def sigma_min(self) -> float:
@@ -62,7 +67,8 @@ class NoiseSchedule:
         """Continuous timesteps in [0, T - 1] of noise levels > 0, float64; clamped at the ends."""
         log_sigma = torch.as_tensor(sigma, dtype=torch.float64).log()
         upper = torch.searchsorted(self.log_sigmas, log_sigma).clamp(1, len(self.log_sigmas) - 1)
-        low, high = self.log_sigmas[upper - 1], self.log_sigmas[upper]
+        low = self.log_sigmas[upper - 1]
+        high = self.log_sigmas[upper]
         return (upper - 1) + ((log_sigma - low) / (high - low)).clamp(0.0, 1.0)
 
     def sigma(self, timestep: Tensor | float) -> Tensor:
@@ -91,7 +97,8 @@ class NoiseSchedule:
 
     def karras_level(self, share: float) -> float:
         """The noise level at a share of the Karras spacing, from 0 (largest) to 1 (smallest)."""
-        high, low = self.sigma_max ** (1 / 7), self.sigma_min ** (1 / 7)
+        high = self.sigma_max ** (1 / 7)
+        low = self.sigma_min ** (1 / 7)
         return (high + share * (low - high)) ** 7
 
 
@@ -102,6 +109,15 @@ def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction
     if prediction_type == "v_prediction":  # x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)
         return alpha(sigma) * (z - sigma * prediction)
     return prediction
+
+
+def to_prediction(denoised: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
+    """The network's output that would mean a prediction of x_0: the inverse of `to_denoised`."""
+    if prediction_type == "epsilon":
+        return (z / alpha(sigma) - denoised) / sigma
+    if prediction_type == "v_prediction":
+        return (z - denoised / alpha(sigma)) / sigma
+    return denoised
 
 
 def alpha(sigma: Tensor | float) -> Any:

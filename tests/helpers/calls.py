@@ -44,8 +44,8 @@ def networks_of(pipe: Any) -> dict[str, nn.Module]:
     """By their names in `report.left_out`."""
     found = {"UNet": pipe.unet, "VAE encoder": pipe.vae.encoder, "VAE decoder": pipe.vae.decoder}
     if pipe.unitouch is not None:
-        modules = {"image": "vision_model", "text": "text_model", "audio": "audio_model", "touch": "touch_model"}
-        found |= {f"{modality} encoder": getattr(pipe.unitouch, name) for modality, name in modules.items()}
+        modules = {"image": "vision_model", "text": "text_model", "audio": "audio_model", "touch": "touch_model.stem"}
+        found |= {f"{modality} encoder": pipe.unitouch.get_submodule(name) for modality, name in modules.items()}
     return found | ({} if pipe.text_encoder is None else {"prompt encoder": pipe.text_encoder})
 
 

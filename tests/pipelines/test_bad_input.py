@@ -24,12 +24,12 @@ GENERATOR = torch.Generator()
 
 # Of an argument, values that cannot be used, and then values of a kind that cannot be.
 NUMBERS = {
-    "guidance_scale": ([NAN, INF, -1e-9, 1e7, 10**400, Fraction(10**400)], ["9", True, [3.0]]),
+    "guidance_scale": ([NAN, INF, -1e-9, 1e7], ["9", True, [3.0], 10**400, Fraction(10**400)]),
     "num_inference_steps": ([0, 10**9], [2.5, "10", True, np.zeros((3, 3)), torch.tensor([])]),
     "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
     "num_images_per_prompt": ([0, 10**9], [1.5, True]),
     "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
-    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3, np.zeros((3, 3))], []),
+    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", ""], [3, np.zeros((3, 3))]),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
     "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),

@@ -195,7 +195,7 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
         call()
     joint.float()
     huge = torch.tensor([1.0, 1e30])[:, None] * 1e10
-    for network in (joint.touch_model, joint.vision_model.visual_projection):
+    for network in (joint.touch_model.projection, joint.vision_model.visual_projection):
         network.register_forward_hook(lambda *args: args[-1] * huge)
     output = call(throw=False)
     assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1

@@ -25,7 +25,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, reading
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.images import denormalise_pixels, local_mean, normalise_pixels
+from unitouch_gen.models.images import denormalise_pixels, local_mean
 from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 from unitouch_gen.saving import saved_whole
@@ -179,17 +179,15 @@ class UniTouchModel(PreTrainedModel):
         indices = [-1 if match.name is None else sensor_bank.index(match.name) for match in matches]
         return torch.tensor(indices, device=self.device)
 
-    def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
-        """Touches (B, 3, S, S) recoloured to the matched sensor: t - background + prototype.
+    def recentre(self, pixels: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
+        """Touches (B, 3, S, S), in [0, 1], recoloured to the matched sensor: t - background + prototype.
 
-        The background (1 or B, 3, S, S) is the touches' own sensor untouched, or its mean image.
+        The background (1 or B, 3, S, S), in [0, 1], is the touches' own sensor untouched, or its mean image.
         """
         _, sensor_bank = self.load("touch")
-        zero = denormalise_pixels(torch.zeros_like(pixel_values[:1]))
-        raw = denormalise_pixels(pixel_values - background) - zero
         prototypes = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
-        prototypes = F.interpolate(prototypes.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
-        return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
+        prototypes = F.interpolate(prototypes.to(pixels), pixels.shape[-2:], mode="bilinear", antialias=True)
+        return (pixels - background + prototypes).clamp(0.0, 1.0)
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 

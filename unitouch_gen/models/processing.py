@@ -92,10 +92,14 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
         From a video or an iterator of frames, the frame of firmest contact is taken; see `videos.firmest`.
         """
+        return normalise_pixels(self.raw_touch(touch, name=name))
+
+    def raw_touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
+        """Pixels of touches in [0, 1] before normalisation, float32 (B, 3, S, S); see `touch`."""
         if isinstance(touch, list | tuple):
             stills = [_still(f"{name}[{row}]", item) for row, item in enumerate(touch)]
-            return self.images(stills, name=name)
-        return self.images(_still(name, touch), name=name)
+            return self.raw_images(stills, name=name)
+        return self.raw_images(_still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cropped."""

@@ -7,7 +7,7 @@ axes alike, so Gaussians along the pixels represent those along any axes.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -18,10 +18,14 @@ from diffusers import DDIMScheduler
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from unitouch_gen.errors import NotConvergedError
-from unitouch_gen.sampling import Guidance, Network, RunReport, prepare_steps, sample
+from unitouch_gen.arguments import SamplingArguments
+from unitouch_gen.errors import NotConvergedError, check_fields
+from unitouch_gen.sampling import Denoiser, Guidance, ReturnCode, RunReport, SampleStatus, prepare_steps, solve
 from unitouch_gen.schedule import NoiseSchedule, alpha
-from unitouch_gen.solvers import MIN_LEVEL_RATIO, Denoise, denoised_at_zero
+from unitouch_gen.solvers import MIN_LEVEL_RATIO, Callback, Denoise, denoised_at_zero
+
+Network = Callable[[Tensor, Tensor], Tensor]
+"""(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
 STABLE_DIFFUSION: dict[str, Any] = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
@@ -120,21 +124,45 @@ class Problem:
 
         return predict
 
+    def denoiser(self, network: Network) -> Denoiser:
+        """What samples with a network, guided."""
+
+        def unet(z: Tensor, timestep: Tensor, return_dict: bool) -> tuple[Tensor]:
+            return (network(z, timestep),)
+
+        return Denoiser(unet, self.schedule, {}, self.guidance)
+
     def run(
         self,
         noise: Tensor,
         solver: str | None = None,
+        *,
         network: Network | None = None,
         scheduler: Any = None,
         throw: bool = True,
-        **steps: Any,
+        **arguments: Any,
     ) -> tuple[Tensor, RunReport]:
-        """Latents and report of one run from unit-variance noise; `steps` are arguments of `prepare_steps`."""
+        """Latents and report of one run from unit-variance noise; `arguments` are `SamplingArguments`."""
+        given = check_fields(SamplingArguments, solver=solver, **arguments)
+        steps, _ = prepare_steps(scheduler or self.scheduler(), given)
+        denoise = self.denoiser(network or self.network(len(noise)))
+        status = SampleStatus(len(noise), noise.device)
         report = RunReport()
-        network = network or self.network(len(noise))
-        made = prepare_steps(scheduler or self.scheduler(), solver=solver, **steps)
-        with report.stage("denoising"):
-            return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
+
+        def note(step: int, x: Tensor, sigma: float) -> Tensor:
+            status.update(step, x * alpha(sigma))
+            report.steps = step + 1
+            return x
+
+        with report.stage("denoising"), torch.no_grad():
+            if isinstance(steps, list):
+                start = noise.float() * math.hypot(1.0, steps[0])
+                latents, ended = solve(denoise, start, steps, given, note)
+            else:
+                latents = run_scheduler(denoise, noise.float(), steps, note)
+                ended = ReturnCode.SUCCESS
+        status.conclude(report, denoise, ended, throw)
+        return latents, report
 
     def path(self, noise: Tensor, sigmas: list[float]) -> list[Tensor]:
         """States of the exact flow at descending noise levels, (B, 4, h, h) float64 each.
@@ -163,6 +191,16 @@ class Problem:
         levels = [MIN_LEVEL_RATIO * last, last]
         states = zip(levels, self.path(noise, levels), strict=True)
         return denoised_at_zero([(sigma, self.denoise(x, sigma)) for sigma, x in states])
+
+
+def run_scheduler(denoise: Denoiser, noise: Tensor, scheduler: Any, callback: Callback) -> Tensor:
+    """diffusers' denoising loop with a scheduler that keeps states variance-preserving and has its timesteps set."""
+    latents = noise
+    for step, timestep in enumerate(scheduler.timesteps):
+        prediction = denoise.predict(latents, timestep)
+        latents = scheduler.step(prediction, timestep, latents, return_dict=False)[0]
+        callback(step, latents, 0.0)
+    return latents
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
