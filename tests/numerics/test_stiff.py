@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.numerics.problems import PROBLEMS, Problem
 from unitouch_gen.numerics.stability import Case, cases, error, within
 from unitouch_gen.pipelines.tiny import tiny
@@ -44,8 +45,10 @@ def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> fl
     along which D is known, carries these errors to the end (Hairer, Nørsett & Wanner, Solving Ordinary Differential
     Equations I, Section II.3). The step to sigma = 0 and roundings are added.
     """
-    made = prepare_steps(problem.scheduler(), solver=solver, num_inference_steps=num_inference_steps)
-    sigmas, higher = torch.tensor(made.sigmas[:-1], dtype=torch.float64), SOLVERS[solver].order > 1
+    arguments = SamplingArguments(solver=solver, num_inference_steps=num_inference_steps)
+    levels, _ = prepare_steps(problem.scheduler(), arguments)
+    sigmas = torch.tensor(levels[:-1], dtype=torch.float64)
+    higher = SOLVERS[solver].order > 1
     values = torch.stack(along(problem, sigmas.tolist()))  # D, (n, 4, d)
     steps = -sigmas.log().diff()[:, None, None]
     slopes = values.diff(dim=0) / steps

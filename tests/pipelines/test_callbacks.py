@@ -51,12 +51,35 @@ def test_other_latents_take_the_place_of_the_state(call):
     assert not call.latents(callback_on_step_end=in_place).any()
 
 
-def test_it_may_interrupt_its_own_call(call):
-    stop = lambda pipe, step, *_: setattr(pipe, "_interrupt", step == 1)  # noqa: E731
-    output = call(num_inference_steps=5, callback_on_step_end=stop, output_type="latent")
-    assert output.report.evaluations == 2 and torch.isfinite(output.images).all()
-    assert output.report.codes == [ReturnCode.INTERRUPTED] * 2 and call.pipe.interrupt
+STEPS = [{"num_inference_steps": 5}, {"num_inference_steps": 5, "solver": "unipc"}, {"tolerance": 0.1}]
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_it_may_interrupt_its_own_call(call, steps):
+    """Before the next evaluation, and without an error, whatever the other samples became."""
+
+    def stop(pipe, step, timestep, tensors):
+        pipe._interrupt = step == 1
+        if broken and step == 0:
+            tensors["latents"][0] = torch.nan
+        return tensors
+
+    broken = False
+    output = call(callback_on_step_end=stop, output_type="latent", **steps)
+    assert output.report.evaluations in (2, 3)  # a tolerance and UniPC begin with one more
+    assert torch.isfinite(output.images).all()
+    assert output.report.codes == [ReturnCode.INTERRUPTED] * 2
+    assert call.pipe.interrupt
+    broken = True
+    report = call(callback_on_step_end=stop, throw=False, **steps).report
+    assert report.codes == [ReturnCode.NON_FINITE, ReturnCode.INTERRUPTED]
     assert call(num_inference_steps=3).report.evaluations == 3
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_a_callback_that_changes_nothing_changes_no_bit(call, steps):
+    nothing = lambda pipe, step, timestep, tensors: tensors  # noqa: E731
+    assert torch.equal(call.latents(callback_on_step_end=nothing, **steps), call.latents(**steps))
 
 
 def test_hidden_states_that_it_returns_count_from_then_on(call):

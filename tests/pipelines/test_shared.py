@@ -7,11 +7,17 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import torch
+from diffusers import EulerDiscreteScheduler
 from torch.testing import assert_close
 
-from tests.helpers.calls import seeded, watched
+from tests.helpers.calls import Call, quiet, seeded, watched
+from tests.helpers.exact import ExactUNet
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+from unitouch_gen.numerics.problems import PROBLEMS, relative_rms
+from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines.base import threads_for
 from unitouch_gen.sampling import ReturnCode
+from unitouch_gen.solvers import DIVERGED_RMS
 
 NAN, INF = float("nan"), float("inf")
 
@@ -201,9 +207,10 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
     assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1
 
 
-def test_a_small_network_takes_one_thread_and_gives_them_back(pipe, touch):
-    """More would wait for each other on a machine that does something else."""
-    seen, before = [], torch.get_num_threads()
+def test_little_work_takes_one_thread_and_gives_the_others_back(pipe, touch):
+    """More would wait for each other on a machine that does something else. Much work takes all there are."""
+    seen = []
+    before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
         for stop in (False, True):
@@ -216,6 +223,81 @@ def test_a_small_network_takes_one_thread_and_gives_them_back(pipe, touch):
 
             with suppress(KeyboardInterrupt):
                 pipe(touch, callback_on_step_end=look)
-            assert set(seen) == {1} and torch.get_num_threads() == 3
+            assert set(seen) == {1}
+            assert torch.get_num_threads() == 3
+        with threads_for(1e12):
+            assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+# What becomes of samples, with the pipeline's own scheduler and with solvers ------------------------------------------
+
+
+@pytest.fixture
+def exact(components, touch):
+    """A pipeline whose network predicts exactly, of data that is Gaussian."""
+    problem = PROBLEMS["gaussian"]
+    components |= {"unet": ExactUNet.of(problem), "scheduler": problem.scheduler()}
+    pipe = TouchToImagePipeline(**components, default_num_inference_steps=8, default_guidance_scale=2.0)
+    return Call(quiet(pipe), {"touch": touch})
+
+
+@pytest.mark.parametrize("steps", [{}, {"solver": "unipc"}, {"tolerance": 0.3}])
+def test_a_sample_that_breaks_leaves_the_other_as_if_alone(exact, steps):
+    evaluations = []
+
+    def damage(unet, args, output):
+        evaluations.append(unet)
+        if len(evaluations) == 3:
+            output[0][1::2] = INF  # of both branches
+        return output
+
+    whole = exact.latents(**steps)
+    hook = exact.pipe.unet.register_forward_hook(damage)
+    with pytest.raises(NonFiniteError, match=r"Sample 1 is not finite after step [123]"):
+        exact(**steps)
+    evaluations.clear()
+    output = exact(throw=False, output_type="latent", **steps)
+    hook.remove()
+    assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE]
+    assert output.report.failed_at[1] in (0, 1, 2)
+    if "tolerance" in steps:  # by which samples choose their steps together
+        assert relative_rms(output.images, whole[:1]) < 0.3
+    else:
+        assert torch.equal(output.images, whole[:1])
+
+
+@pytest.mark.parametrize("steps", [{}, {"solver": "heun"}, {"tolerance": 0.1}])
+def test_a_sample_that_diverges_is_reported_at_its_step(exact, steps):
+    def grow(pipe, step, timestep, tensors):
+        if step == 1:
+            tensors["latents"][0] = 2 * DIVERGED_RMS * tensors["latents"][0].sign()
+        return tensors
+
+    report = exact(callback_on_step_end=grow, **steps).report
+    assert report.codes == [ReturnCode.DIVERGED, ReturnCode.SUCCESS]
+    assert report.failed_at == {0: 1}
+
+
+@pytest.mark.parametrize(("size", "code"), [(2.0, ReturnCode.DIVERGED), (0.5, ReturnCode.SUCCESS)])
+def test_states_are_judged_as_networks_see_them(exact, size, code):
+    """Of a diffusers scheduler that keeps x = z sqrt(1 + sigma^2)."""
+    exact.pipe.scheduler = EulerDiscreteScheduler.from_config(exact.pipe.scheduler.config)
+    shown = []
+    exact.pipe.unet.register_forward_pre_hook(lambda unet, args: shown.append(args[0].square().mean().sqrt().item()))
+
+    def grow(pipe, step, timestep, tensors):
+        scale = size * DIVERGED_RMS / shown[-1] if step == 0 else 1.0
+        return {"latents": scale * tensors["latents"]}
+
+    report = exact(callback_on_step_end=grow, throw=False).report
+    assert shown[1] > 0.8 * size * DIVERGED_RMS
+    assert report.codes == [code] * 2
+
+
+@pytest.mark.parametrize("steps", [{}, {"solver": "heun"}, {"tolerance": 0.3}])
+def test_the_progress_bar_reaches_its_end(exact, steps, capsys):
+    exact.pipe.set_progress_bar_config(disable=False)
+    exact(**steps)
+    assert "100%" in capsys.readouterr().err.splitlines()[-1]

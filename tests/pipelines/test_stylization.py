@@ -5,9 +5,13 @@ import torch
 from torch.testing import assert_close
 
 from tests.helpers.calls import diffusers_pipeline, quiet, seeded, watched
+from tests.helpers.exact import ExactUNet
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models.autoencoders import encode
-from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.numerics.problems import Problem, gaussian, relative_rms
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline
+from unitouch_gen.sampling import prepare_steps
 
 NORM = 3.0
 
@@ -92,6 +96,26 @@ def test_little_init_strength_keeps_the_photo(stylize, photo, touch):
             for share in (0.01, 1.0)
         )
         assert (near - shown).abs().mean() < 0.05 * (far - shown).abs().mean()
+
+
+@pytest.mark.parametrize("solver", [None, "ddim", "dpm++2m", "unipc"])
+def test_from_a_photos_latents_the_exact_flow_goes_on_where_they_lie(components, photo, touch, solver):
+    """Of Gaussian data of known variances v, x - m goes as sqrt(v + sigma^2)."""
+    problem = Problem("pixels", gaussian(0.01, 64, mean=0.0))
+    components |= {"unet": ExactUNet.of(problem), "scheduler": problem.scheduler()}
+    pipe = quiet(TactileStylizationPipeline(**components, default_guidance_scale=1.0))
+    small = photo[:1, :, :8, :8]
+    noise = torch.randn(1, 4, 4, 4, generator=seeded(2))
+    options = {"layout": None, "num_inference_steps": 60, "init_strength": 0.5, "output_type": "latent"}
+    found = pictures(pipe, small, touch[:1], latents=noise, solver=solver, **options)
+    with torch.no_grad():
+        init = encode(pipe.vae, 2 * small - 1)
+    arguments = SamplingArguments(solver=solver, num_inference_steps=60, init_strength=0.5)
+    steps, _ = prepare_steps(pipe.scheduler, arguments)
+    sigma = problem.schedule.sigma(steps.timesteps[0]).item() if solver is None else steps[0]
+    variances = problem.data.variances[0].view(1, 4, 4, 4)
+    exact = (variances / (variances + sigma**2)).sqrt() * (init + sigma * noise)
+    assert relative_rms(found, exact).max() < (0.25 if solver in (None, "ddim") else 0.03)
 
 
 def test_init_strength_is_the_share_of_steps_that_are_made(stylize, photo, touch):

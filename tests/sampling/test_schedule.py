@@ -12,7 +12,7 @@ from diffusers import (
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, to_denoised
+from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, to_denoised, to_prediction
 
 CONFIGS = [
     {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"},
@@ -81,6 +81,7 @@ def test_any_output_is_read_as_a_ddim_step_of_diffusers_reads_it(kind):
         sigma = (1 / scheduler.alphas_cumprod[timestep].item() - 1) ** 0.5
         expected = scheduler.step(output, timestep, z).pred_original_sample
         torch.testing.assert_close(to_denoised(output, z, sigma, kind), expected, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(to_prediction(expected, z, sigma, kind), output, rtol=1e-9, atol=1e-9)
 
 
 def test_guiding_any_prediction_guides_the_data():
