@@ -147,13 +147,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
 
     def _check_arguments(self, **given: Any) -> SamplingArguments:
-        """The arguments of a call, checked; guidance and steps are the checkpoint's where they are `None`."""
+        """The arguments of a call, checked, with the checkpoint's steps and bank where they are `None`."""
         self._check_device()
         arguments = check_fields(SamplingArguments, **given)
         config = self.config
         changes: dict[str, Any] = {}
-        if arguments.guidance_scale is None:
-            changes["guidance_scale"] = check_number("guidance_scale", config.default_guidance_scale, 0.0, MAX_SCALE)
         if arguments.tolerance is None and arguments.timesteps is None:
             steps = arguments.num_inference_steps
             usual = steps in (None, config.default_num_inference_steps)

@@ -139,7 +139,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             height=height,
             width=width,
             num_inference_steps=num_inference_steps,
-            guidance_scale=guidance_scale,
+            guidance_scale=self.config.default_guidance_scale if guidance_scale is None else guidance_scale,
             strength=strength,
             num_images_per_prompt=num_images_per_prompt,
             noise_level=self.config.default_noise_level if noise_level is None else noise_level,

@@ -217,7 +217,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             width=width,
             num_inference_steps=num_inference_steps,
             timesteps=timesteps,
-            guidance_scale=guidance_scale,
+            guidance_scale=self.config.default_guidance_scale if guidance_scale is None else guidance_scale,
             strength=self.config.default_strength if strength is None else strength,
             num_images_per_prompt=num_images_per_prompt,
             noise_level=self.config.default_noise_level if noise_level is None else noise_level,
@@ -296,9 +296,8 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     def _check_arguments(self, **given: Any) -> SamplingArguments:
         arguments = super()._check_arguments(**given)
-        if arguments.noise_level is not None:
-            top = self.image_noising_scheduler.config.num_train_timesteps - 1
-            check_integer("noise_level", arguments.noise_level, 0, top)
+        top = self.image_noising_scheduler.config.num_train_timesteps - 1
+        check_integer("noise_level", arguments.noise_level, 0, top)
         return arguments
 
     def _check_prompts(

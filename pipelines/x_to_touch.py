@@ -189,7 +189,7 @@ class XToTouchPipeline(UniTouchPipeline):
             width=width,
             num_inference_steps=num_inference_steps,
             timesteps=timesteps,
-            guidance_scale=guidance_scale,
+            guidance_scale=self.config.default_guidance_scale if guidance_scale is None else guidance_scale,
             num_images_per_prompt=num_images_per_prompt,
             bridge=bridge,
             solver=solver,

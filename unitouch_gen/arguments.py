@@ -13,9 +13,9 @@ Integer = Annotated[int, BeforeValidator(plain_integer)]
 
 
 class SamplingArguments(BaseModel):
-    """Arguments that are the same for all pictures of a call; `None` is the checkpoint's default, or no such limit.
+    """Arguments that are the same for all pictures of a call, as `errors.check_fields` makes them of a user's values.
 
-    `errors.check_fields` makes one of values that a user passed.
+    Pipelines have defaults of their own for some; `None` is the UNet's size, or the usual number of steps.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
@@ -23,7 +23,7 @@ class SamplingArguments(BaseModel):
     # Size and number of pictures
     height: Integer | None = Field(None, ge=1, le=16_384, description="Height of the picture in pixels.")
     width: Integer | None = Field(None, ge=1, le=16_384, description="Width of the picture in pixels.")
-    num_images_per_prompt: Integer = Field(1, ge=1, le=100_000, description="Pictures for each input.")
+    num_images_per_prompt: Integer = Field(1, ge=1, le=100_000, description="Number of pictures for each input.")
 
     # Steps
     num_inference_steps: Integer | None = Field(None, ge=1, description="Number of solver steps.")
@@ -39,11 +39,9 @@ class SamplingArguments(BaseModel):
     init_strength: float = Field(1.0, ge=0.0, le=1.0, description="Share of the steps to run from the photo's latents.")
 
     # Conditioning
-    guidance_scale: float | None = Field(None, ge=0.0, le=MAX_SCALE, description="Guidance scale; active above 1.")
-    strength: float | None = Field(None, ge=0.0, le=MAX_SCALE, description="Scale of the touch embedding.")
-    noise_level: Integer | None = Field(
-        None, ge=0, description="Noise added to the embedding: more noise, more variety."
-    )
+    guidance_scale: float = Field(1.0, ge=0.0, le=MAX_SCALE, description="Guidance scale; active above 1.")
+    strength: float = Field(1.0, ge=0.0, le=MAX_SCALE, description="Scale of the touch embedding.")
+    noise_level: Integer = Field(0, ge=0, description="Noise added to the embedding: more noise, more variety.")
     bridge: bool | None = Field(None, description="Whether to move embeddings towards stored image embeddings.")
     touch_weight: float | None = Field(None, ge=0.0, le=MAX_SCALE, description="Weight of the touch in the mix.")
     image_weight: float | None = Field(None, ge=0.0, le=MAX_SCALE, description="Weight of the photo in the mix.")

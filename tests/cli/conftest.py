@@ -1,13 +1,12 @@
 """What tests of the command line share: commands that run in this process, and saved pipelines of random weights."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from tests.helpers import components
@@ -15,14 +14,6 @@ from unitouch_gen.cli import main
 
 Result = tuple[int, str, str]
 """Exit code, standard output, standard error."""
-
-
-@pytest.fixture(autouse=True)
-def threads() -> Iterator[None]:
-    """Those of the other tests afterwards: commands may choose a number for the process that they run in."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """`unitouch-gen`: commands, a thin layer over the pipelines. Each command imports its dependencies when it runs."""
 
+import os
 import signal
 import sys
 from contextlib import suppress
@@ -49,6 +50,8 @@ commands.add_typer(data, name="data")
 
 def main() -> None:
     """Entry point. A user's mistake ends in one line and exit code 2."""
+    # Before torch is imported: threads that wait for each other leave the processors to other processes.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with suppress(ValueError):  # raised outside of the main thread
         interrupt_on_termination()
     sys.exit(run_commands(commands, "unitouch-gen"))

@@ -123,7 +123,6 @@ def load_pipeline(
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
-    take_one_thread(model)
     if model is None or TURBO.get(model) == name:
         pipe: Any = tiny(model or name, dtype=weights_dtype)
     else:
@@ -142,7 +141,6 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 
     transformers.utils.logging.disable_progress_bar()
-    take_one_thread(model)
     folder = JOINT if model is None else folder_of(model)
     joint = folder
     processor = folder
@@ -151,17 +149,6 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
         processor = folder / "processor"
     with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
-
-
-def take_one_thread(model: str | None) -> None:
-    """Sets one thread for built-in networks, also outside of a pipeline's call, which does so itself.
-
-    On a busy machine, threads of networks so small wait for each other in every layer, and take forty times as long.
-    """
-    import torch
-
-    if model is None and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)
 
 
 def folder_of(model: str) -> Path:

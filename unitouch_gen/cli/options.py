@@ -10,35 +10,26 @@ from typing import Annotated, Any
 
 from typer import Argument, Context, Option
 
+from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import check_writable
 
-SETTABLE = (
-    "bridge",
-    "eta",
-    "guidance_scale",
-    "height",
-    "init_strength",
-    "keep_colours",
-    "layout",
-    "max_evaluations",
-    "mix",
-    "noise_level",
-    "num_inference_steps",
-    "solver",
-    "strength",
-    "tolerance",
-    "touch_weight",
-    "weights",
-    "width",
-)
-"""Arguments of pipelines' calls that `--set` takes, which are the same for all pictures of a call."""
+SETTABLE = sorted({name for name, field in SamplingArguments.model_fields.items() if field.description} | {"weights"})
+"""Arguments of pipelines' calls that are the same for all pictures of a call."""
 
 MAX_SEED = 2**32 - 1  # torch's CPU generators use 32 bits, so 2**32 would be the same seed as 0
 
 FILE = {"exists": True, "dir_okay": False}
 A_FOLDER = "Folder or repository id of"
 SEVERAL = "files, folders, patterns or example:NAME"
+
+
+def sampling_option(name: str, *flags: str) -> Any:
+    """The option of a sampling argument, with its bounds and its description."""
+    field = SamplingArguments.model_fields[name]
+    bounds = {key: getattr(one, key) for one in field.metadata for key in ("ge", "le") if hasattr(one, key)}
+    return Option(*flags, min=bounds.get("ge"), max=bounds.get("le"), help=field.description)
+
 
 # Inputs and outputs
 Touches = Annotated[list[str], Argument(help=f"Touch images, or videos: {SEVERAL}.")]
@@ -49,28 +40,18 @@ AsJson = Annotated[bool, Option("--json", metavar="", help="Print one JSON objec
 # Arguments of calls; the checkpoint's own values are used for those that are left out
 Prompt = Annotated[str | None, Option(help="Description of the picture beside the touch.")]
 NegativePrompt = Annotated[str | None, Option(help="Description that guidance moves the picture away from.")]
-Strength = Annotated[float | None, Option(min=0, help="Scale of the touch embedding.")]
-NoiseLevel = Annotated[
-    int | None, Option(min=0, max=999, help="Noise added to the embedding; more noise gives more variety.")
-]
+Strength = Annotated[float | None, sampling_option("strength")]
+NoiseLevel = Annotated[int | None, sampling_option("noise_level")]
 Sensor = Annotated[str | None, Option(help="Sensor that took the touches; retrieved from the images if left out.")]
 Background = Annotated[
     Path | None, Option(**FILE, help="Image of the untouched sensor, for a sensor that the model does not know.")
 ]
-Steps = Annotated[
-    int | None, Option("--num-inference-steps", "--steps", min=1, max=1000, help="Number of solver steps.")
-]
-Solver = Annotated[str | None, Option(help="Name of the solver, such as ddim or dpm++2m.")]
-Tolerance = Annotated[
-    float | None, Option(min=1e-5, max=1, help="Relative error of the latents, in place of a number of steps.")
-]
-Guidance = Annotated[
-    float | None, Option("--guidance-scale", "--guidance", min=0, help="Guidance scale; active above 1.")
-]
+Steps = Annotated[int | None, sampling_option("num_inference_steps", "--num-inference-steps", "--steps")]
+Solver = Annotated[str | None, sampling_option("solver")]
+Tolerance = Annotated[float | None, sampling_option("tolerance")]
+Guidance = Annotated[float | None, sampling_option("guidance_scale", "--guidance-scale", "--guidance")]
 Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: width=160, bridge=false.")]
-Images = Annotated[
-    int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Number of pictures for each input.")
-]
+Images = Annotated[int, sampling_option("num_images_per_prompt", "--num-images-per-prompt", "--images")]
 Seed = Annotated[int, Option(min=0, max=MAX_SEED, help="Seed of the noise; equal seeds give equal pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in one call; fewer take less memory.")]
 
