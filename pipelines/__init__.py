@@ -7,6 +7,10 @@ from unitouch_gen.pipelines.touch_to_text import TouchToTextPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
 __all__ = [
-    "TactileStylizationPipeline", "TouchToImagePipeline", "TouchToTextPipeline", "TouchToTextPipelineOutput",
-    "UniTouchPipelineOutput", "XToTouchPipeline",
-]  # fmt: skip
+    "TactileStylizationPipeline",
+    "TouchToImagePipeline",
+    "TouchToTextPipeline",
+    "TouchToTextPipelineOutput",
+    "UniTouchPipelineOutput",
+    "XToTouchPipeline",
+]

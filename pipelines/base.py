@@ -46,7 +46,7 @@ from unitouch_gen.models.images import ImageInput, centre_rectangle, normalise_p
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
-from unitouch_gen.pipelines.hub import CARD, Card, located, name_classes
+from unitouch_gen.pipelines.hub import CARD, Card, name_classes, resolve_classes
 from unitouch_gen.sampling import (
     Denoiser,
     Guidance,
@@ -66,8 +66,10 @@ StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tens
 EndStep = Callable[[int, Tensor, Tensor], Tensor]  # (step, timestep, latents) -> latents to go on from
 
 SMALL_WORK = 1e10
-"""Weights times positions of an evaluation below which more threads of a CPU than one mostly wait for each other: the
-built-in networks' on four rows, two pictures with guidance, are under it."""
+"""Work of an evaluation, in weights times positions, below which several threads of a CPU mostly wait for each other.
+
+The built-in networks stay below it with four rows: two pictures with guidance.
+"""
 
 _OPENMP = ThreadpoolController().select(user_api="openmp")
 
@@ -118,7 +120,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
-        self._weights = self.unet.num_parameters()
+        self._num_weights = self.unet.num_parameters()
         self._check_widths(network)
 
     def _check_widths(self, network: str) -> None:
@@ -295,7 +297,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _threads(self, shape: Sequence[int], guidance: Guidance) -> Any:
         """Threads for evaluations on latents (B n, C, h, w); see `threads_for`."""
         samples, _, height, width = shape
-        return threads_for(self._weights * samples * (1 + guidance.active) * height * width)
+        return threads_for(self._num_weights * samples * (1 + guidance.active) * height * width)
 
     def _denoise(
         self,
@@ -525,7 +527,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """model_index.json as diffusers reads it, with our classes in place of the folder's Python files."""
         loaded = super().load_config(*args, **kwargs)
         config = loaded[0] if isinstance(loaded, tuple) else loaded
-        config.update(located(config))
+        config.update(resolve_classes(config))
         return loaded
 
     def save_pretrained(

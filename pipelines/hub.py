@@ -19,8 +19,13 @@ from unitouch_gen.errors import check_file
 from unitouch_gen.models import LanguageBridge, UniTouchConfig, UniTouchModel, UniTouchProcessor
 
 __all__ = [
-    "EmbeddingBank", "LanguageBridge", "SensorBackgrounds", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor",
-]  # fmt: skip
+    "EmbeddingBank",
+    "LanguageBridge",
+    "SensorBackgrounds",
+    "UniTouchConfig",
+    "UniTouchModel",
+    "UniTouchProcessor",
+]
 
 _KINDS = (EmbeddingBank, LanguageBridge, SensorBackgrounds, UniTouchModel, UniTouchProcessor)
 PARTS = {kind.__name__: kind for kind in _KINDS}
@@ -30,7 +35,8 @@ CODE = '''"""The classes of this folder are in the package `unitouch_gen`, which
 from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
-CARD, PICTURES = "README.md", "pictures"
+CARD = "README.md"
+PICTURES = "pictures"
 TEMPLATE = Path(__file__).with_name("card.md")
 
 
@@ -49,16 +55,16 @@ def name_classes(folder: Path) -> None:
     file.write_text(json.dumps(index, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def located(index: Mapping[str, Any]) -> dict[str, Any]:
+def resolve_classes(index: Mapping[str, Any]) -> dict[str, Any]:
     """The entries of a model_index.json that name such files, with our modules instead."""
-    found: dict[str, Any] = {}
+    resolved: dict[str, Any] = {}
     for name, value in index.items():
         if isinstance(value, list | tuple) and len(value) == 2 and value[0] == MODULE:
             if name == "_class_name":
-                found[name] = value[1]
+                resolved[name] = value[1]
             elif value[1] in PARTS:
-                found[name] = [PARTS[value[1]].__module__, value[1]]
-    return found
+                resolved[name] = [PARTS[value[1]].__module__, value[1]]
+    return resolved
 
 
 @dataclass(frozen=True)
@@ -87,11 +93,20 @@ class Card:
             (folder / PICTURES).mkdir(exist_ok=True)
             shutil.copyfile(file, folder / places[caption])
         data = ModelCardData(
-            license=self.license.lower() or None, library_name="diffusers", pipeline_tag=pipe._task,
+            license=self.license.lower() or None,
+            library_name="diffusers",
+            pipeline_tag=pipe._task,
             tags=["unitouch_gen", "touch", "tactile"],
-        )  # fmt: skip
+        )
         card = ModelCard.from_template(
-            data, str(TEMPLATE), card=self, pipe=pipe, kind=type(pipe).__name__, name=name, title=Path(name).name,
-            description=self.description or str(type(pipe).__doc__).splitlines()[0], pictures=places,
-        )  # fmt: skip
+            data,
+            str(TEMPLATE),
+            card=self,
+            pipe=pipe,
+            kind=type(pipe).__name__,
+            name=name,
+            title=Path(name).name,
+            description=self.description or str(type(pipe).__doc__).splitlines()[0],
+            pictures=places,
+        )
         card.save(folder / CARD)

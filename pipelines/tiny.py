@@ -53,7 +53,9 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         16
     """
     teacher = TURBO.get(check_choice("name", name, [*PIPELINES, *TURBO]), name)
-    kind, dtype, family = PIPELINES[teacher], check_dtype("dtype", dtype), _family(family)
+    kind = PIPELINES[teacher]
+    dtype = check_dtype("dtype", dtype)
+    family = _family(family)
     folder = family / ("touch-to-image" if teacher == "stylization" else teacher)  # which share their networks
 
     stored = partial(read_network, torch_dtype=dtype)
@@ -98,14 +100,16 @@ def distilled(pipe: Any, folder: Path) -> Any:
     needed("peft")
     if not folder.is_dir():
         raise InvalidInputError(f"{str(folder)!r} is no folder of LoRA weights; make them by `unitouch-gen distill`.")
-    made, unet = copy.copy(pipe), copy.deepcopy(pipe.unet)
+    made = copy.copy(pipe)
+    unet = copy.deepcopy(pipe.unet)
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
     unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)
     if not getattr(unet, "peft_config", None):
         raise InvalidInputError(f"{str(folder)!r} holds no LoRA weights of a UNet.")
     unet.fuse_lora()
     unet.unload_lora()
-    made.unet, made.scheduler = unet, LCMScheduler.from_config(pipe.scheduler.config)
+    made.unet = unet
+    made.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
     made.register_to_config(**read_settings("folder", folder / "defaults.json"))
     return made
 

@@ -69,7 +69,7 @@ class TouchToTextPipeline(UniTouchPipeline):
             unitouch=unitouch,
             processor=processor,
         )
-        self._weights = language_model.num_parameters()
+        self._num_weights = language_model.num_parameters()
         if QUESTION not in check_kind("prompt_template", prompt_template, str):
             raise InvalidInputError(f"`prompt_template` is {prompt_template!r}; it has to hold '{QUESTION}'.")
         self.register_to_config(prompt_template=prompt_template)
@@ -112,30 +112,14 @@ class TouchToTextPipeline(UniTouchPipeline):
         """
         # 1. Check inputs, before any network runs
         self._check_device()
-        passed = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
-        names = [name for name, value in passed.items() if value is not None]
-        if len(names) != 1:
-            raise InvalidInputError("One of `touch`, `image` and `touch_embeds` has to be passed.")
-        (name,) = names
-        inputs: Any = touch_embeds  # touches, pixel values, or embeddings
-        if name == "touch":
-            inputs = self._read_touches(touch, sensor, background)
-            batch_size = len(inputs.pixels)
-        else:
-            check_unused(name, sensor=sensor, background=background)
-            if name == "image":
-                self._joint("image")
-                inputs = self.processor.images(image)
-            else:
-                check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
-            batch_size = len(inputs)
+        name, inputs, batch_size = self._read_inputs(touch, image, touch_embeds, sensor=sensor, background=background)
         if generator is not None:
             check_kind("generator", generator, torch.Generator)
         prompts = self._tokenize(question, batch_size)
         config, options = self._check_options(prompts, max_new_tokens, generate)
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
 
-        with threads_for(self._weights * sum(report.prompt_tokens)):
+        with threads_for(self._num_weights * sum(report.prompt_tokens)):
             # 2. Encode the touch
             with report.stage(name):
                 embeds = self._encode(name, inputs, report)
@@ -169,7 +153,7 @@ class TouchToTextPipeline(UniTouchPipeline):
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
         self._check_device()
         touches = self._read_touches(touch, sensor, background)
-        with threads_for(self._weights * len(touches.pixels)):
+        with threads_for(self._num_weights * len(touches.pixels)):
             return self._encode("touch", touches, AnswerReport())
 
     def _encode(self, name: str, inputs: Any, report: AnswerReport) -> Tensor:
@@ -179,6 +163,32 @@ class TouchToTextPipeline(UniTouchPipeline):
         if name == "image":
             return self._match_norm(self.unitouch.get_image_features(inputs), "image")
         return inputs
+
+    def _read_inputs(
+        self,
+        touch: ImageInput,
+        image: ImageInput,
+        touch_embeds: Tensor | None,
+        *,
+        sensor: SensorNames,
+        background: ImageInput,
+    ) -> tuple[str, Any, int]:
+        """Which of the inputs was passed; its touches, pixel values or embeddings; and their number."""
+        passed = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
+        names = [name for name, value in passed.items() if value is not None]
+        if len(names) != 1:
+            raise InvalidInputError("One of `touch`, `image` and `touch_embeds` has to be passed.")
+        (name,) = names
+        if name == "touch":
+            touches = self._read_touches(touch, sensor, background)
+            return name, touches, len(touches.pixels)
+        check_unused(name, sensor=sensor, background=background)
+        if name == "image":
+            self._joint("image")
+            pixel_values = self.processor.images(image)
+            return name, pixel_values, len(pixel_values)
+        embeds = check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
+        return name, embeds, len(embeds)
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""

@@ -29,9 +29,12 @@ def match_norm(embeds: Tensor, norm: float) -> Tensor:
 
 
 def noise_embeddings(
-    embeds: Tensor, noise_level: Tensor, noise: Tensor, normalizer: StableUnCLIPImageNormalizer,
+    embeds: Tensor,
+    noise_level: Tensor,
+    noise: Tensor,
+    normalizer: StableUnCLIPImageNormalizer,
     scheduler: SchedulerMixin,
-) -> Tensor:  # fmt: skip
+) -> Tensor:
     """Noised embeddings with their noise level: the class labels of an unCLIP UNet.
 
     c = [ unscale(sqrt(abar_l) scale(e) + sqrt(1 - abar_l) n) | sinusoid(l) ], as in
@@ -47,8 +50,10 @@ def noise_embeddings(
     Returns:
         (B, 2 D).
     """
-    mean, std = normalizer.mean.to(embeds), normalizer.std.to(embeds)
-    noised = scheduler.add_noise((embeds - mean) / std, noise=noise, timesteps=noise_level) * std + mean  # type: ignore[attr-defined]
+    mean = normalizer.mean.to(embeds)
+    std = normalizer.std.to(embeds)
+    scaled = (embeds - mean) / std
+    noised = scheduler.add_noise(scaled, noise=noise, timesteps=noise_level) * std + mean  # type: ignore[attr-defined]
     level = get_timestep_embedding(noise_level, embeds.shape[-1], flip_sin_to_cos=True, downscale_freq_shift=0)
     return torch.cat([noised, level.to(noised)], dim=1)
 

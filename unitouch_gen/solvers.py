@@ -157,7 +157,8 @@ def sample_adaptive(
 
     Returns x at sigma = 0 and `True`; or, after `max_evaluations` (at least 2), the last D and `False`.
     """
-    sigma, last = sigmas[0], sigmas[-1]
+    sigma = sigmas[0]
+    last = sigmas[-1]
     local_tolerance = 0.5 * tolerance  # errors partly cancel, and the corrector is better than the predictor
     proposed = 0.6 * local_tolerance**0.5  # in log sigma; the error of the first step grows with its square
     levels: Levels = [(sigma, denoise(x, sigma))]
