@@ -64,9 +64,14 @@ def watched(pipe: Any) -> list[tuple[str, int]]:
 def diffusers_pipeline(components: dict[str, Any]) -> StableUnCLIPImg2ImgPipeline:
     """diffusers' own unCLIP pipeline of the same components."""
     config = CLIPVisionConfig(
-        hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2, image_size=32, patch_size=8,
+        hidden_size=16,
+        intermediate_size=32,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        image_size=32,
+        patch_size=8,
         projection_dim=D,
-    )  # fmt: skip
+    )
     shared = {key: value for key, value in components.items() if key not in ("unitouch", "processor")}
     encoder = CLIPVisionModelWithProjection(config).eval()
     processor = CLIPImageProcessor(size=32, crop_size=32)

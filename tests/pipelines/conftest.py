@@ -12,7 +12,8 @@ from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-_COMPONENTS, _X_TO_TOUCH = make_components(), make_x_to_touch()
+_COMPONENTS = make_components()
+_X_TO_TOUCH = make_x_to_touch()
 DEFAULTS = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
 
 

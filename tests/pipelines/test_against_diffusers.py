@@ -15,8 +15,16 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 CPU = torch.device("cpu")
-SCHEDULERS = ("DDIM", "DDPM", "DPMSolverMultistep", "EulerAncestralDiscrete", "EulerDiscrete", "HeunDiscrete", "PNDM",
-              "UniPCMultistep")  # fmt: skip
+SCHEDULERS = (
+    "DDIM",
+    "DDPM",
+    "DPMSolverMultistep",
+    "EulerAncestralDiscrete",
+    "EulerDiscrete",
+    "HeunDiscrete",
+    "PNDM",
+    "UniPCMultistep",
+)
 
 
 @pytest.fixture
@@ -122,7 +130,8 @@ def lora(tmp_path, components):
 def test_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
     plain = draw(pipe)
     pipe.load_lora_weights(lora[0], adapter_name="bricks")
-    whole, half = draw(pipe), draw(diffusers_pipeline(components), **HALF)  # on networks that both share
+    whole = draw(pipe)  # on networks that both share
+    half = draw(diffusers_pipeline(components), **HALF)
     assert close(whole, lora[1]) and close(draw(pipe, **HALF), half) and close(draw(pipe, **NONE), plain)
     assert not any(close(one, other) for one, other in ((whole, plain), (half, plain), (half, whole)))
     with torch.no_grad():
@@ -137,8 +146,10 @@ def test_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
 
 
 def test_weights_of_each_pipeline_are_scaled_saved_and_loaded(call, tmp_path):
-    plain, layers = call.latents(), adapter(call.pipe.unet, "to_v", "to_out.0")
-    half, whole = call.latents(**HALF), call.latents()
+    plain = call.latents()
+    layers = adapter(call.pipe.unet, "to_v", "to_out.0")
+    half = call.latents(**HALF)
+    whole = call.latents()
     assert close(call.latents(**NONE), plain) and not close(half, plain)
     call.pipe.set_adapters("made", 0.5)
     assert close(call.latents(), half)

@@ -17,7 +17,8 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 RATE = 16_000
 TONE = np.sin(2 * np.pi * 440 * np.arange(4_000) / RATE)
 GENERATOR = torch.Generator()
@@ -26,64 +27,97 @@ GENERATOR = torch.Generator()
 NUMBERS = {
     "guidance_scale": ([NAN, INF, -1e-9, 1e7], ["9", True, [3.0], 10**400, Fraction(10**400)]),
     "num_inference_steps": ([0, 10**9], [2.5, "10", True, np.zeros((3, 3)), torch.tensor([])]),
-    "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
+    "height": ([17, 0, 10**9], [16.0, "16"]),
+    "width": ([17, 10**400], [16.5]),
     "num_images_per_prompt": ([0, 10**9], [1.5, True]),
-    "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
-    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", ""], [3, np.zeros((3, 3))]),
+    "eta": ([2, -0.1, NAN], ["0"]),
+    "tolerance": ([0, NAN, 2.0], ["tight"]),
+    "throw": ([], ["no", 1]),
+    "output_type": (["PIL", None, 3], []),
+    "solver": (["dpm++2", ""], [3, np.zeros((3, 3))]),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
-    "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
+    "callback_on_step_end": ([], [3]),
+    "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
     "cross_attention_kwargs": ([{"scale": NAN}], [0, ["scale"], {"scale": "half"}]),
-}  # fmt: skip
+}
 TO_IMAGE = {
-    "strength": ([-0.1, NAN, 1e7], ["1", False]), "noise_level": ([-1, 1000], [1.5, NAN, "0"]),
-    "prompt": ([["a", "b", "c"], [], "rough \ud800"], [3, ["a", 3]]), "negative_prompt": ([["a", "b", "c"]], [3]),
+    "strength": ([-0.1, NAN, 1e7], ["1", False]),
+    "noise_level": ([-1, 1000], [1.5, NAN, "0"]),
+    "prompt": ([["a", "b", "c"], [], "rough \ud800"], [3, ["a", 3]]),
+    "negative_prompt": ([["a", "b", "c"]], [3]),
     "prompt_embeds": (
-        [torch.zeros(3, 12, 16), torch.zeros(2, 12, 8), torch.zeros(12, 16), torch.full((1, 12, 16), NAN),
-         torch.zeros(1, 7, 16)], [[0.0], torch.ones(1, 12, 16).bool(), torch.ones(1, 12, 16).to_sparse()],
+        [
+            torch.zeros(3, 12, 16),
+            torch.zeros(2, 12, 8),
+            torch.zeros(12, 16),
+            torch.full((1, 12, 16), NAN),
+            torch.zeros(1, 7, 16),
+        ],
+        [[0.0], torch.ones(1, 12, 16).bool(), torch.ones(1, 12, 16).to_sparse()],
     ),
     "negative_prompt_embeds": ([torch.zeros(3, 12, 16)], []),
     "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None]]),
     "sensor": (["gelsigt", "", ["gelsight"] * 3, [], [3, None]], [3]),
-    "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]), "bridge": ([True], ["london", 1]),
-}  # fmt: skip
+    "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]),
+    "bridge": ([True], ["london", 1]),
+}
 STYLIZE = {
-    "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
-    "touch_weight": ([1.2, -0.1, NAN], ["much", [0.1] * 3]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
+    "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []),
+    "touch": ([None], []),
+    "mix": (["slurp", 3], []),
+    "touch_weight": ([1.2, -0.1, NAN], ["much", [0.1] * 3]),
+    "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
     "init_strength": ([1.5, -0.1, NAN], ["much", np.ones((2, 2))]),
-}  # fmt: skip
+}
 TO_TOUCH = {
     "text": (["  \n", ["brick", ""], []], [3]),
-    "audio": ([(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
-              [(torch.eye(100).to_sparse(), RATE)]),
+    "audio": (
+        [(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
+        [(torch.eye(100).to_sparse(), RATE)],
+    ),
     "source_sensor": (["digit"], []),
-    "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []), "background": ([torch.zeros(3, 16, 16)], []),
+    "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []),
+    "background": ([torch.zeros(3, 16, 16)], []),
     "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {3: 1}, {}], [[1.0]]),
-    "bridge": ([], ["london", 1]), "condition_embeds": ([torch.ones(1, 1, 16)], []),
-}  # fmt: skip
+    "bridge": ([], ["london", 1]),
+    "condition_embeds": ([torch.ones(1, 1, 16)], []),
+}
 TABLES = {"pipe stylize x_to_touch": NUMBERS, "pipe stylize": TO_IMAGE, "stylize": STYLIZE, "x_to_touch": TO_TOUCH}
 # Arguments that do not fit each other; the first of them is named.
 PAIRS = {
     "pipe stylize x_to_touch": [
-        {"tolerance": 0.1, "num_inference_steps": 5}, {"tolerance": 0.1, "solver": "heun"}, {"max_evaluations": 5},
+        {"tolerance": 0.1, "num_inference_steps": 5},
+        {"tolerance": 0.1, "solver": "heun"},
+        {"max_evaluations": 5},
         {"callback_on_step_end": SDCFGCutoffCallback(cutoff_step_ratio=0.5), "tolerance": 0.1},
         {"latents": torch.zeros(2, 4, 8, 8), "height": 32},
         {"generator": [GENERATOR] * 2, "num_images_per_prompt": 2},
     ],
     "pipe": [
         *({"touch_embeds": bad, "touch": None} for bad in (torch.ones(2, 8), torch.ones(16), torch.full((2, 16), NAN))),
-        {"touch": torch.zeros(3, 32, 32), "touch_embeds": torch.ones(2, 16)}, {"touch": None},
+        {"touch": torch.zeros(3, 32, 32), "touch_embeds": torch.ones(2, 16)},
+        {"touch": None},
         {"prompt": "a", "prompt_embeds": torch.zeros(1, 12, 16)},
-        *({name: value, "touch": None, "touch_embeds": torch.ones(1, 16)} for name, value in
-          {"sensor": "digit", "strength": 0.5, "background": torch.zeros(3, 32, 32), "bridge": True}.items()),
+        *(
+            {name: value, "touch": None, "touch_embeds": torch.ones(1, 16)}
+            for name, value in {
+                "sensor": "digit",
+                "strength": 0.5,
+                "background": torch.zeros(3, 32, 32),
+                "bridge": True,
+            }.items()
+        ),
     ],
     "stylize": [{"touch_weight": 0, "image_weight": 0}],
     "x_to_touch": [
-        {"image": None}, {"image": torch.zeros(2, 3, 32, 32), "text": ["a", "b", "c"]},
-        {"weights": {"text": 1}, "text": "a"}, {"text": "a", "image": None, "condition_embeds": torch.ones(1, 1, 16)},
+        {"image": None},
+        {"image": torch.zeros(2, 3, 32, 32), "text": ["a", "b", "c"]},
+        {"weights": {"text": 1}, "text": "a"},
+        {"text": "a", "image": None, "condition_embeds": torch.ones(1, 1, 16)},
         *({"condition_embeds": bad, "image": None} for bad in (torch.zeros(1, 16), torch.zeros(1, 1, 32))),
     ],
-}  # fmt: skip
+}
 
 
 def calls_by_argument():
@@ -102,7 +136,8 @@ def calls_by_argument():
 @pytest.fixture(scope="module")
 def guarded():
     """A call of each pipeline, whose networks fail the test if they run."""
-    pipes, pictures = make_pipelines(), torch.rand(2, 3, 32, 32)
+    pipes = make_pipelines()
+    pictures = torch.rand(2, 3, 32, 32)
     calls = {
         "pipe": Call(pipes["touch-to-image"], {"touch": pictures}),
         "stylize": Call(pipes["stylize"], {"touch": pictures, "image": pictures}),
@@ -134,7 +169,8 @@ def test_what_needs_a_part_that_is_missing(components, x_components, touch):
     config = type(joint.config).from_dict(joint.config.to_dict() | {"sensors": []})
     sensorless = TouchToImagePipeline(**components | {"unitouch": UniTouchModel(config)})
     joint.sensor_bank.known.fill_(False)  # its prototypes
-    embeds, states = torch.ones(2, 16), torch.zeros(1, 12, 16)
+    embeds = torch.ones(2, 16)
+    states = torch.zeros(1, 12, 16)
     for pipe, name, options in (
         (bare, "touch", {"touch": touch}),
         (bare, "prompt", {"touch_embeds": embeds, "prompt": "brick"}),
@@ -158,7 +194,7 @@ def test_parts_and_settings_that_do_not_fit_are_refused_by_name(pipe, components
         "embedding_bank": lambda: TouchToImagePipeline(**{**components, "embedding_bank": EmbeddingBank(3, 7)}),
         "unet": lambda: XToTouchPipeline(**{**x_components, "unet": unclip}),
         "sensors": lambda: XToTouchPipeline(**x_components, sensors=["gelsight"]),
-    }.items():  # fmt: skip
+    }.items():
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}`"):
             make()
     for name, make in {

@@ -42,7 +42,8 @@ def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_
 
 
 def test_a_tolerance_is_kept(call):
-    found, reference = call(tolerance=0.1, output_type="latent"), call.latents(solver="dpm++2m", num_inference_steps=30)
+    found = call(tolerance=0.1, output_type="latent")
+    reference = call.latents(solver="dpm++2m", num_inference_steps=30)
     assert (found.images - reference).norm() / reference.norm() < 0.12
     assert found.report.evaluations < 40 and found.report.solver == "adaptive"
 
@@ -97,7 +98,8 @@ LEVELS = [999, 619, 299, 79]
 
 @pytest.fixture(scope="module")
 def family(tmp_path_factory):
-    peft, folder = pytest.importorskip("peft", reason="LoRA needs peft"), tmp_path_factory.mktemp("family")
+    peft = pytest.importorskip("peft", reason="LoRA needs peft")
+    folder = tmp_path_factory.mktemp("family")
     torch.manual_seed(0)
     write_small_family(folder)
     for name in TURBO.values():

@@ -28,7 +28,8 @@ def states_of(call, **options) -> list[torch.Tensor]:
 
 
 def test_it_gets_what_was_asked_for_after_every_step(call):
-    names, calls = list(call.pipe._callback_tensor_inputs), []
+    names = list(call.pipe._callback_tensor_inputs)
+    calls = []
 
     note = lambda pipe, *given: calls.append((pipe.unet, pipe.num_timesteps, *given[:2], list(given[2])))  # noqa: E731
     scheduler = type(call.pipe.scheduler).from_config(call.pipe.scheduler.config)
@@ -83,7 +84,8 @@ def test_a_callback_that_changes_nothing_changes_no_bit(call, steps):
 
 
 def test_hidden_states_that_it_returns_count_from_then_on(call):
-    name, options = call.pipe._callback_tensor_inputs[1], {"num_inference_steps": 3}
+    name = call.pipe._callback_tensor_inputs[1]
+    options = {"num_inference_steps": 3}
     other = torch.randn(4, 1 if name == "condition_embeds" else 12, 16, generator=seeded())
     change = {"callback_on_step_end": lambda *_: {name: other}}
     one, two = (call.latents(callback_on_step_end_tensor_inputs=asked, **change, **options) for asked in ([], [name]))
@@ -92,7 +94,8 @@ def test_hidden_states_that_it_returns_count_from_then_on(call):
 
 def test_a_new_scale_is_that_of_the_next_step_and_ends_with_its_call(call):
     options = {"num_inference_steps": 3, "solver": "ddim"}
-    states, expected = states_of(call, **options), call.latents(**options)
+    states = states_of(call, **options)
+    expected = call.latents(**options)
     strong = call.latents(callback_on_step_end=put(states, at=0), guidance_scale=7.0, **options)
     assert_close(call.latents(callback_on_step_end=set_scale(7.0), **options), strong, atol=1e-5, rtol=1e-5)
     assert torch.equal(call.latents(**options), expected)
@@ -111,16 +114,19 @@ def cut_off(pipe, step, timestep, tensors):
 def test_guidance_may_be_turned_off(call, kind):
     """From the state that two guided steps left, a single branch goes on."""
     name = call.pipe._callback_tensor_inputs[1]
-    callback, inputs = cut_off, [name]
+    callback = cut_off
+    inputs = [name]
     if kind == "several":
         if name == "condition_embeds":
             pytest.skip("diffusers' callback names `prompt_embeds`")
         callback = MultiPipelineCallbacks([SDCFGCutoffCallback(cutoff_step_ratio=None, cutoff_step_index=1)])
-        call, inputs = call.one(0), []  # it keeps one row of the prompts
+        call = call.one(0)  # it keeps one row of the prompts
+        inputs = []
     options = {"num_inference_steps": 4, "solver": "ddim", "output_type": "latent"}
     states = states_of(call, guidance_scale=5.0, **options)
     expected = call(guidance_scale=1.0, callback_on_step_end=put(states, at=1), **options).images
-    ran, options["guidance_scale"] = watched(call.pipe), 5.0
+    ran = watched(call.pipe)
+    options["guidance_scale"] = 5.0
     output = call(callback_on_step_end=callback, callback_on_step_end_tensor_inputs=inputs, **options)
     assert_close(output.images, expected, atol=1e-5, rtol=1e-5)
     rows = [rows for name, rows in ran if name == "UNet"]

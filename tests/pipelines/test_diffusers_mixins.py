@@ -92,7 +92,8 @@ class Parts(
     test_layerwise_casting = test_group_offloading = True
 
     def get_dummy_components(self) -> dict[str, Any]:
-        parts, of_touch = make_components(), make_x_to_touch()
+        parts = make_components()
+        of_touch = make_x_to_touch()
         if self.pipeline_class is ToImage:
             return {**parts, "embedding_bank": None}
         latents = {"in_channels": 4, "out_channels": 4, "num_class_embeds": None}  # `sensors` are no part

@@ -50,9 +50,13 @@ def test_our_loader_reads_a_repository(family, touch, monkeypatch):
 def test_a_card_is_one_that_huggingface_reads(pipe, tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "shown.png")
     card = Card(
-        description="Touches of bricks.", figures={"bricks named right": 0.5}, data="Bricks.", license="apache-2.0",
-        limits="No tiles.", pictures={"A brick": tmp_path / "shown.png"},
-    )  # fmt: skip
+        description="Touches of bricks.",
+        figures={"bricks named right": 0.5},
+        data="Bricks.",
+        license="apache-2.0",
+        limits="No tiles.",
+        pictures={"A brick": tmp_path / "shown.png"},
+    )
     pipe.save_pretrained(tmp_path / "one", card=card)
     read = ModelCard.load(tmp_path / "one" / "README.md")
     assert (read.data.license, read.data.library_name) == ("apache-2.0", "diffusers")
@@ -74,7 +78,8 @@ def test_the_example_of_a_card_runs(call, tmp_path, monkeypatch):
 
 
 def test_an_upload_holds_the_card_and_all_that_loaders_need(pipe, tmp_path, monkeypatch):
-    uploaded, repository = {}, huggingface_hub.RepoUrl(f"https://huggingface.co/{REPOSITORY}")
+    uploaded = {}
+    repository = huggingface_hub.RepoUrl(f"https://huggingface.co/{REPOSITORY}")
 
     def upload(self, folder, repo_id, **options):
         files = [file for file in Path(folder).rglob("*") if file.is_file()]

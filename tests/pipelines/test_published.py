@@ -22,7 +22,8 @@ to_image = TouchToImagePipeline.from_published
 def parts(tmp_path_factory):
     """Folders: a joint space, one of touch alone, an unCLIP with its image encoder, and one with another."""
     folder, other = (tmp_path_factory.mktemp("parts") for _ in range(2))
-    joint, alone = converted(folder), converted(other, imagebind=False)
+    joint = converted(folder)
+    alone = converted(other, imagebind=False)
     unclip = write_unclip(folder / "unclip", UniTouchModel.from_pretrained(joint, modalities=("image",)).vision_model)
     torch.manual_seed(3)
     other = write_unclip(other / "unclip", CLIPVisionModelWithProjection(sizes().vision_config))
@@ -92,9 +93,14 @@ def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path):
         torch.save({}, file.with_suffix(".bin"))
         file.unlink() if kind == "pickled" else file.write_bytes(file.read_bytes()[:-500])
     for unclip, joint, options, named in (
-        ("./gone", "joint", {}, "unclip"), ("unclip", "../gone", {}, "unitouch"), ("joint", "joint", {}, "unclip"),
-        ("unclip", "unclip", {}, "unitouch"), ("pickled", "joint", {}, "unclip"), ("broken", "joint", {}, "unclip"),
-        ("unclip", "narrow", {}, "unitouch"), ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
-    ):  # fmt: skip
+        ("./gone", "joint", {}, "unclip"),
+        ("unclip", "../gone", {}, "unitouch"),
+        ("joint", "joint", {}, "unclip"),
+        ("unclip", "unclip", {}, "unitouch"),
+        ("pickled", "joint", {}, "unclip"),
+        ("broken", "joint", {}, "unclip"),
+        ("unclip", "narrow", {}, "unitouch"),
+        ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
+    ):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
             to_image(places.get(unclip, unclip), places.get(joint, joint), **options)

@@ -110,7 +110,8 @@ def test_a_variant_lies_beside_the_whole_one(other, there, tmp_path, family):
 def test_weights_that_are_cut_or_do_not_fill_a_network_and_pickles_are_refused(there, part):
     """diffusers would draw the rest at random, and say so in a line on standard error."""
     file = there / part / "diffusion_pytorch_model.safetensors"
-    state, whole = load_file(file), file.read_bytes()
+    state = load_file(file)
+    whole = file.read_bytes()
     torch.save(state, file.with_suffix(".bin"))
     save_file(dict(list(state.items())[1:]), file, metadata={"format": "pt"})
     with pytest.raises(InvalidInputError, match=rf"{there}/{part}. holds \d+ of the \d+ numbers"):
@@ -242,7 +243,8 @@ def test_components_make_another_pipeline(call):
 
 
 def test_every_network_sets_off_its_hook_in_the_order_of_offloading(call):
-    order, notes = call.pipe.model_cpu_offload_seq.split("->"), list[str]()
+    order = call.pipe.model_cpu_offload_seq.split("->")
+    notes = list[str]()
     parts = {name for name, part in call.pipe.components.items() if isinstance(part, torch.nn.Module)}
     assert parts <= {*order, *call.pipe._exclude_from_cpu_offload}
     for name in order:

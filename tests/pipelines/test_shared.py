@@ -19,7 +19,8 @@ from unitouch_gen.pipelines.base import threads_for
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.solvers import DIVERGED_RMS
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 
 
 def noise_for(call, seed: int = 0) -> torch.Tensor:
@@ -107,7 +108,8 @@ def test_a_pipeline_without_numbers_is_refused(call):
 @pytest.mark.parametrize("solver", [None, "dpm++2m"])
 def test_every_solver_makes_finite_pictures_and_leaves_the_scheduler_as_it_was(call, solver):
     scheduler = call.pipe.scheduler
-    config, timesteps = dict(scheduler.config), scheduler.timesteps.clone()
+    config = dict(scheduler.config)
+    timesteps = scheduler.timesteps.clone()
     output = call(solver=solver, num_inference_steps=4)
     assert torch.isfinite(output.images).all()
     assert output.report.solver == (solver or "DDIMScheduler") and output.report.steps == 4
@@ -128,7 +130,8 @@ def test_other_precisions_are_near_float32_on_a_float32_state(call, dtype, near)
 
 
 def test_only_what_a_call_needs_runs_and_the_report_says_what_was_left_out(call):
-    ran, needed = watched(call.pipe), {f"{name} encoder" for name in ("image", "touch") if name in call.inputs}
+    ran = watched(call.pipe)
+    needed = {f"{name} encoder" for name in ("image", "touch") if name in call.inputs}
     needed |= set() if call.pipe.text_encoder is None else {"prompt encoder"}
     left_out = call().report.left_out
     assert {name for name, _ in ran} == {*needed, "UNet", "VAE decoder"}

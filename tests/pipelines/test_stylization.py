@@ -33,7 +33,8 @@ def embeds(stylize, photo, touch) -> dict[str, torch.Tensor]:
 
 
 def test_mixes_are_their_closed_forms(stylize, photo, touch, embeds):
-    one, other = embeds["touch"], embeds["image"]
+    one = embeds["touch"]
+    other = embeds["image"]
     paper = 0.3 * one + 0.7 * other
     expected = {"paper": paper, "linear": NORM * paper / paper.norm(dim=1, keepdim=True)}
     for mix, embedding in expected.items():
@@ -76,7 +77,8 @@ def test_a_photo_alone_is_diffusers_image_variation(stylize, components, photo, 
 @pytest.mark.parametrize("how", [{"solver": "ddim"}, {"solver": "heun"}, {"tolerance": 0.1}])
 def test_a_layout_as_fine_as_the_latents_is_the_photo(stylize, photo, touch, how):
     """D' is the photo itself, whatever the network predicts; without the colours all but each channel's mean."""
-    small, options = photo[:, :, :16, :16], {"guidance_scale": 3.0, "output_type": "latent", **how}
+    small = photo[:, :, :16, :16]
+    options = {"guidance_scale": 3.0, "output_type": "latent", **how}
     with torch.no_grad():
         latents = encode(stylize.vae, 2 * small - 1)
     assert_close(pictures(stylize, small, touch, layout=100, keep_colours=True, **options), latents, atol=1e-3, rtol=0)
@@ -120,7 +122,8 @@ def test_from_a_photos_latents_the_exact_flow_goes_on_where_they_lie(components,
 
 def test_init_strength_is_the_share_of_steps_that_are_made(stylize, photo, touch):
     """As a callback is told, too; a photo of another size is cut to the picture."""
-    seen, options = [], {"init_strength": 0.4, "layout": None, "num_inference_steps": 10, "height": 32, "width": 16}
+    seen = []
+    options = {"init_strength": 0.4, "layout": None, "num_inference_steps": 10, "height": 32, "width": 16}
     note = lambda pipe, step, *_: seen.append((step, pipe.num_timesteps))  # noqa: E731
     output = stylize(photo, touch, callback_on_step_end=note, output_type="pt", **options)
     assert (output.report.steps, output.report.evaluations) == (4, 4)

@@ -32,7 +32,8 @@ def test_strength_is_a_gain_on_the_norm_of_images(pipe, touch):
 def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch):
     bank = EmbeddingBank.of(torch.randn(20, pipe.embedding_dim, generator=seeded(1)))
     pipe.register_modules(embedding_bank=bank)
-    plain, output = pipe.encode_touch(touch, bridge=False), pipe(touch)
+    plain = pipe.encode_touch(touch, bridge=False)
+    output = pipe(touch)
     assert_close(output.embeds, bank.bridge(plain))
     assert torch.equal(pipe.encode_touch(touch), output.embeds) and not torch.allclose(output.embeds, plain)
     assert torch.equal(pipe(touch, bridge=False).embeds, plain)
@@ -66,7 +67,8 @@ def test_a_background_takes_the_look_of_its_sensor_away(pipe, touch):
 
 @pytest.mark.parametrize(("fixture", "encode"), [("pipe", "encode_touch"), ("x_to_touch", "encode_condition")])
 def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode, monkeypatch):
-    pipe, reasons = request.getfixturevalue(fixture), ["unlike anything known", None]
+    pipe = request.getfixturevalue(fixture)
+    reasons = ["unlike anything known", None]
     features = UniTouchModel.get_touch_features
     monkeypatch.setattr(UniTouchModel, "encode_touches", lambda self, *given: (features(self, *given), reasons))
     for call in (pipe, getattr(pipe, encode)):
@@ -81,7 +83,8 @@ def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch
 
 
 def test_the_noise_level_is_the_checkpoints_unless_a_call_says_another(draw, pipe):
-    clean, noisy = draw(noise_level=0), draw(noise_level=999)
+    clean = draw(noise_level=0)
+    noisy = draw(noise_level=999)
     assert torch.equal(draw(), clean) and (clean - noisy).abs().max() > 1e-3
     pipe.register_to_config(default_noise_level=999)
     assert torch.equal(draw(), noisy)
@@ -97,7 +100,8 @@ def test_prompts_are_what_they_are_when_left_out(draw):
 
 
 def test_prompts_go_to_their_touches_and_are_encoded_once(pipe, touch):
-    prompts, options = ["rough brick", "smooth grey metal"], {"output_type": "pt"}
+    prompts = ["rough brick", "smooth grey metal"]
+    options = {"output_type": "pt"}
     together = pipe(touch, prompts, generator=[seeded(1), seeded(2)], **options).images
     alone = [pipe(touch[i], prompts[i], generator=seeded(i + 1), **options).images for i in range(2)]
     assert_close(together, torch.cat(alone), atol=1e-4, rtol=0)
@@ -108,12 +112,14 @@ def test_prompts_go_to_their_touches_and_are_encoded_once(pipe, touch):
 
 def test_embeddings_alone_need_no_encoders(components, pipe, draw):
     with torch.no_grad():
-        embeds, negative = pipe.encode_prompt(["rough brick"]), pipe.encode_prompt(["metal"] * 2)
+        embeds = pipe.encode_prompt(["rough brick"])
+        negative = pipe.encode_prompt(["metal"] * 2)
     expected = draw(prompt="rough brick", negative_prompt="metal")
     assert_close(draw(prompt_embeds=embeds, negative_prompt_embeds=negative), expected, atol=1e-6, rtol=0)
     components |= dict.fromkeys(("unitouch", "processor", "tokenizer", "text_encoder"))
     pipe = quiet(TouchToImagePipeline(**components, default_num_inference_steps=2))
-    states, embeds = torch.randn(1, 12, 16, generator=seeded()), torch.ones(1, 16)
+    states = torch.randn(1, 12, 16, generator=seeded())
+    embeds = torch.ones(1, 16)
     for options in ({"negative_prompt_embeds": 0 * states}, {"guidance_scale": 1.0, "negative_prompt": "metal"}):
         output = pipe(touch_embeds=embeds, prompt_embeds=states, output_type="pt", **options)
         assert torch.isfinite(output.images).all() and "prompt encoder" in output.report.left_out

@@ -15,7 +15,8 @@ from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.pipelines import TouchToTextPipeline
 
 EMBEDS = torch.randn(3, D, generator=seeded(3))
-QUESTION, SHORT = "How does it feel?", {"max_new_tokens": 6, "min_new_tokens": 6}
+QUESTION = "How does it feel?"
+SHORT = {"max_new_tokens": 6, "min_new_tokens": 6}
 
 
 @pytest.fixture
@@ -44,8 +45,10 @@ def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, to
 def test_one_input_has_several_questions_or_answers(ask, photo):
     several = ask(touch_embeds=EMBEDS[:1], question=[QUESTION, "Where?"], num_beams=2, num_return_sequences=2, **SHORT)
     assert len(several.texts) == 4 and several.embeds.shape == (1, D)
-    assert several.texts[:2] == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2,
-                                    **SHORT).texts  # fmt: skip
+    assert (
+        several.texts[:2]
+        == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2, **SHORT).texts
+    )
     seen = ask(image=photo, question=QUESTION, **SHORT)
     assert_close(seen.embeds.norm(dim=1), torch.full((2,), 3.0))
 
@@ -68,7 +71,8 @@ def test_prompts_are_put_as_the_language_model_was_trained_and_streamed(ask):
     for template, chat in (("{question}", None), ("Q: {question} A:", None), ("{question}", chat_template)):
         ask.register_to_config(prompt_template=template)
         ask.tokenizer.chat_template = chat
-        streamer, given = TextIteratorStreamer(ask.tokenizer, timeout=60), {"touch_embeds": EMBEDS[:1], **SHORT}
+        streamer = TextIteratorStreamer(ask.tokenizer, timeout=60)
+        given = {"touch_embeds": EMBEDS[:1], **SHORT}
         with ThreadPoolExecutor(1) as pool:
             answer = pool.submit(ask, question="Where?", streamer=streamer, **given)
             printed = "".join(streamer)
@@ -97,8 +101,10 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         network.register_forward_pre_hook(fail)
     two = {"touch": touch, "question": QUESTION}
     for name, error, options in (
-        ("touch", InvalidInputError, {"question": QUESTION}), ("touch", InvalidInputError, {**two, "image": photo}),
-        ("question", InvalidTypeError, {"touch": touch}), ("question", InvalidInputError, {**two, "question": " \n"}),
+        ("touch", InvalidInputError, {"question": QUESTION}),
+        ("touch", InvalidInputError, {**two, "image": photo}),
+        ("question", InvalidTypeError, {"touch": touch}),
+        ("question", InvalidInputError, {**two, "question": " \n"}),
         ("question", InvalidInputError, {**two, "question": [QUESTION] * 3}),
         ("question", InvalidInputError, {**two, "question": "a" * 64}),
         ("max_new_tokens", InvalidInputError, {**two, "max_new_tokens": 64}),
@@ -109,7 +115,7 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
         ("generator", InvalidTypeError, {**two, "generator": 3}),
         ("touch_embeds", InvalidInputError, {"touch_embeds": torch.ones(1, 8), "question": QUESTION}),
         ("sensor", InvalidInputError, {"image": photo, "question": QUESTION, "sensor": "digit"}),
-    ):  # fmt: skip
+    ):
         with pytest.raises(error, match=f"`{name}`") as caught:
             ask(**options)
         assert type(caught.value) is error
@@ -127,10 +133,12 @@ def test_parts_that_do_not_fit_are_refused(components):
     parts = make_language_parts()
     joint = {name: components[name] for name in ("unitouch", "processor")}
     for words, change in (
-        ("`unitouch` has width 16, but `language_bridge` takes 8",
-         {"language_bridge": LanguageBridge.for_model(parts["language_model"], 8), **joint}),
+        (
+            "`unitouch` has width 16, but `language_bridge` takes 8",
+            {"language_bridge": LanguageBridge.for_model(parts["language_model"], 8), **joint},
+        ),
         ("`prompt_template` is 'Answer'", {"prompt_template": "Answer"}),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InvalidInputError, match=words):
             TouchToTextPipeline(**{**parts, **change})
     with pytest.raises(InvalidInputError, match="`touch` needs the joint space"):

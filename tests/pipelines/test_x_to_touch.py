@@ -28,7 +28,9 @@ def inputs(photo, touch) -> dict:
 @torch.no_grad()
 @pytest.mark.parametrize("modality", ["image", "text", "audio", "touch"])
 def test_a_condition_is_the_modalitys_embedding_at_the_norm_of_images(x_to_touch, inputs, modality):
-    model, processor, given = x_to_touch.unitouch, x_to_touch.processor, inputs[modality]
+    model = x_to_touch.unitouch
+    processor = x_to_touch.processor
+    given = inputs[modality]
     embeds = {
         "image": lambda: model.get_image_features(processor.images(given)),
         "text": lambda: model.get_text_features(**processor.text(given)),
@@ -59,7 +61,8 @@ def test_several_modalities_are_mixed_by_weight(x_to_touch, inputs):
 
 def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
     """Of what is no image; where there is a bank, unless a call says otherwise."""
-    bank, text = x_to_touch.embedding_bank, inputs["text"]
+    bank = x_to_touch.embedding_bank
+    text = inputs["text"]
     raw = x_to_touch.encode_condition(text=text, bridge=False)
     settings = {key: bank.config[key] for key in ("neighbours", "temperature", "share")}
     moved = bridge_nearest(raw[:, 0], bank.embeds, **settings)[:, None]
@@ -77,7 +80,8 @@ def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
 def test_ddim_by_hand(x_to_touch, inputs):
     """A plain transcription of guided DDIM with a zero token as the unconditional branch."""
     embeds = x_to_touch.encode_condition(text=inputs["text"])
-    noise, label = torch.randn(1, 3, 8, 8, generator=seeded(3)), torch.tensor([1])
+    noise = torch.randn(1, 3, 8, 8, generator=seeded(3))
+    label = torch.tensor([1])
     scheduler = DDIMScheduler.from_config(x_to_touch.scheduler.config)
     scheduler.set_timesteps(3)
     state = noise * scheduler.init_noise_sigma
@@ -91,7 +95,8 @@ def test_ddim_by_hand(x_to_touch, inputs):
 
 def test_each_sensor_has_its_own_image(x_to_touch):
     """The first where none is named, several of one input, and "all" of each input in turn."""
-    texts, sensors = ["rough brick", "smooth metal"], ["gelsight", "digit"]
+    texts = ["rough brick", "smooth metal"]
+    sensors = ["gelsight", "digit"]
     noise = torch.randn(4, 3, 8, 8, generator=seeded())
     pairs = [(text, sensor) for text in texts for sensor in sensors]
     each = [draw(x_to_touch, text=t, sensor=s, latents=noise[[row]]) for row, (t, s) in enumerate(pairs)]
@@ -145,7 +150,8 @@ def test_a_sensor_is_known_by_its_name_or_by_its_background(x_to_touch, tmp_path
 
 
 def test_sensors_and_backgrounds_that_do_not_fit_are_refused(x_to_touch):
-    gel, one = torch.zeros(3, 16, 16), ("gelsight",)
+    gel = torch.zeros(3, 16, 16)
+    one = ("gelsight",)
     several = {"background": gel.expand(3, -1, -1, -1), "text": ["a", "b"]}
     for sensors, options in ((one, {"sensor": "gelsight", "background": gel}), (one, several), ((), {})):
         with pytest.raises(InvalidInputError, match="`background`"):

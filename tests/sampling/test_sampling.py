@@ -49,15 +49,20 @@ def test_steps_that_cannot_be_made_are_refused():
         ({"timesteps": [9], "solver": "heun"}, "`solver` is 'heun', but has no effect with `timesteps`"),
         ({"timesteps": [9], "tolerance": 0.1}, "`timesteps` is .* no effect with `tolerance`"),
         ({"timesteps": [500, 999]}, "`timesteps` is .*; each has to be below the one before"),
-        ({"timesteps": [1000, 1]}, "`timesteps` is 1000"), ({"timesteps": 5}, "`timesteps` is"),
+        ({"timesteps": [1000, 1]}, "`timesteps` is 1000"),
+        ({"timesteps": 5}, "`timesteps` is"),
         ({"timesteps": [999, 9]}, "DDIMScheduler chooses its own"),
         ({"timesteps": [99, 9], "scheduler": diffusers.DDPMScheduler()}, "99, 9], .* starts at timestep 99 of 1000"),
         ({"init_strength": 0.5, "scheduler": diffusers.FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),
-        ({"num_inference_steps": 1000, "scheduler": diffusers.DDIMScheduler(steps_offset=1)},
-         "1000, with .* timestep 1000 of"),
-        ({"num_inference_steps": 1, "scheduler": diffusers.EulerDiscreteScheduler(timestep_spacing="leading")},
-         "timestep 0 of"),
-    ):  # fmt: skip
+        (
+            {"num_inference_steps": 1000, "scheduler": diffusers.DDIMScheduler(steps_offset=1)},
+            "1000, with .* timestep 1000 of",
+        ),
+        (
+            {"num_inference_steps": 1, "scheduler": diffusers.EulerDiscreteScheduler(timestep_spacing="leading")},
+            "timestep 0 of",
+        ),
+    ):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=words):
             steps_of(**arguments)
 
@@ -66,12 +71,17 @@ def test_steps_that_cannot_be_made_are_refused():
 @pytest.mark.parametrize(
     "how",
     [
-        "ddim", "unipc", diffusers.DDIMScheduler(**STABLE_DIFFUSION), diffusers.HeunDiscreteScheduler(),
-        diffusers.PNDMScheduler(skip_prk_steps=True, **STABLE_DIFFUSION), diffusers.LCMScheduler(),
+        "ddim",
+        "unipc",
+        diffusers.DDIMScheduler(**STABLE_DIFFUSION),
+        diffusers.HeunDiscreteScheduler(),
+        diffusers.PNDMScheduler(skip_prk_steps=True, **STABLE_DIFFUSION),
+        diffusers.LCMScheduler(),
         diffusers.UniPCMultistepScheduler(use_exponential_sigmas=True, prediction_type="v_prediction"),
-        diffusers.EulerDiscreteScheduler(use_karras_sigmas=True), diffusers.TCDScheduler(),
+        diffusers.EulerDiscreteScheduler(use_karras_sigmas=True),
+        diffusers.TCDScheduler(),
     ],
-)  # fmt: skip
+)
 def test_a_start_lies_at_its_share_whatever_the_number_of_steps(how, share):
     given = {"scheduler": OWN, "solver": how} if isinstance(how, str) else {"scheduler": how}
 
@@ -151,7 +161,8 @@ def test_sound_runs_are_a_success_and_too_few_steps_for_a_guidance_diverge(solve
 
 
 def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
-    report, started = RunReport(), time.perf_counter()
+    report = RunReport()
+    started = time.perf_counter()
     for _ in range(2):
         with suppress(KeyError), report.stage("touch"):
             time.sleep(0.01)
@@ -160,9 +171,16 @@ def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
 
 
 def test_it_is_a_line_of_solver_counts_time_and_outcome_and_goes_through_json_as_a_copy():
-    report = RunReport(solver="unipc", steps=10, evaluations=10, seconds={"touch": 0.25, "denoising": 1.5},
-                       codes=[SUCCESS, NON_FINITE], failed_at={1: 3}, left_out=["VAE"],
-                       unknown={"touch": ["unlike anything known", None]})  # fmt: skip
+    report = RunReport(
+        solver="unipc",
+        steps=10,
+        evaluations=10,
+        seconds={"touch": 0.25, "denoising": 1.5},
+        codes=[SUCCESS, NON_FINITE],
+        failed_at={1: 3},
+        left_out=["VAE"],
+        unknown={"touch": ["unlike anything known", None]},
+    )
     values = json.loads(json.dumps(report.to_dict()))
     assert values["codes"] == ["success", "non_finite"] and values["failed_at"] == {"1": 3}
     assert values["seconds"] == report.seconds

@@ -76,7 +76,8 @@ def test_any_output_is_read_as_a_ddim_step_of_diffusers_reads_it(kind):
     scheduler = DDIMScheduler(**CONFIGS[0], prediction_type=kind, clip_sample=False)
     scheduler.alphas_cumprod = scheduler.alphas_cumprod.double()
     scheduler.set_timesteps(10)
-    output, z = draw(2, 4, 3, 3), draw(2, 4, 3, 3, seed=1)
+    output = draw(2, 4, 3, 3)
+    z = draw(2, 4, 3, 3, seed=1)
     for timestep in (1, 501, 901):
         sigma = (1 / scheduler.alphas_cumprod[timestep].item() - 1) ** 0.5
         expected = scheduler.step(output, timestep, z).pred_original_sample
@@ -85,7 +86,9 @@ def test_any_output_is_read_as_a_ddim_step_of_diffusers_reads_it(kind):
 
 
 def test_guiding_any_prediction_guides_the_data():
-    both, z, guidance = draw(4, 4, 3, 3), draw(2, 4, 3, 3, seed=1), Guidance(7.5)
+    both = draw(4, 4, 3, 3)
+    z = draw(2, 4, 3, 3, seed=1)
+    guidance = Guidance(7.5)
     for kind in PREDICTION_TYPES:
         expected = guidance.combine(to_denoised(both, torch.cat([z] * 2), 1.7, kind))
         torch.testing.assert_close(to_denoised(guidance.combine(both), z, 1.7, kind), expected, rtol=1e-9, atol=1e-9)

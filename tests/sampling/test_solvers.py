@@ -14,7 +14,8 @@ from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedule import alpha
 from unitouch_gen.solvers import SOLVERS, denoised_at_zero, exponential_integral, sample_ddim
 
-MIXTURE, GAUSSIAN = PROBLEMS["mixture"], PROBLEMS["gaussian"]
+MIXTURE = PROBLEMS["mixture"]
+GAUSSIAN = PROBLEMS["gaussian"]
 NOISE = MIXTURE.noise(3).float()
 KARRAS = {**STABLE_DIFFUSION, "use_karras_sigmas": True, "timestep_spacing": "linspace"}
 THEIRS = {
@@ -45,7 +46,8 @@ def by_diffusers(scheduler, steps: int, start: torch.Tensor, **options) -> torch
 def test_steps_are_those_of_diffusers(name):
     """But for the last one, of second order here, and UniPC's first corrector, which is simplified there."""
     THEIRS["euler"].set_timesteps(11)
-    sigmas, seen = THEIRS["euler"].sigmas.tolist(), []
+    sigmas = THEIRS["euler"].sigmas.tolist()
+    seen = []
     SOLVERS[name].sample(
         lambda x, sigma: seen.append(x * alpha(sigma)) or MIXTURE.denoise(x, sigma).float(),
         NOISE * math.hypot(1.0, sigmas[0]),
@@ -58,11 +60,13 @@ def test_steps_are_those_of_diffusers(name):
 def test_ddim_is_that_of_diffusers(eta, steps):
     scheduler = diffusers.DDIMScheduler(**STABLE_DIFFUSION, clip_sample=False, timestep_spacing="trailing")
     scheduler.set_timesteps(steps)
-    z, network = NOISE, MIXTURE.network(3)
+    z = NOISE
+    network = MIXTURE.network(3)
     for timestep in scheduler.timesteps:
         generator = torch.Generator().manual_seed(int(timestep))
         z = scheduler.step(network(z, timestep), timestep, z, eta=eta, generator=generator, return_dict=False)[0]
-    schedule, sigmas = MIXTURE.schedule, MIXTURE.schedule.trailing(steps)
+    schedule = MIXTURE.schedule
+    sigmas = MIXTURE.schedule.trailing(steps)
     left = iter(schedule.timestep(torch.tensor(sigmas)).round().int().tolist())
     draw = lambda x: torch.randn(x.shape, generator=torch.Generator().manual_seed(next(left)))  # noqa: E731
     x = NOISE * math.hypot(1.0, sigmas[0])
@@ -84,7 +88,8 @@ def test_differences_fall_at_the_order_of_the_solver(problem, solver):
 
 
 def test_one_step_goes_all_the_way_and_no_noise_stays():
-    x, sigmas = torch.full((1, 1, 2, 2), 15.0), GAUSSIAN.schedule.karras(20)
+    x = torch.full((1, 1, 2, 2), 15.0)
+    sigmas = GAUSSIAN.schedule.karras(20)
     for solver, levels in itertools.product(SOLVERS.values(), ([sigmas[0], 0.0], [*sigmas, 0.0])):
         assert solver.sample(lambda x, sigma: torch.zeros_like(x), x, levels).abs().max() < 1e-6
 
@@ -112,7 +117,8 @@ def test_the_last_step_continues_data_that_goes_with_sigma_squared_from_levels_t
 @pytest.mark.parametrize("name", ["gaussian", "gaussian-guided", "gaussian-cosine", "mixture-7.5"])
 def test_the_result_is_within_tolerance_for_more_evaluations_the_tighter(name):
     """Within twice of it: the constant is measured, not proved."""
-    problem, evaluations = PROBLEMS[name], []
+    problem = PROBLEMS[name]
+    evaluations = []
     noise = problem.noise(8)
     truth = problem.solution(noise)
     for tolerance in (0.1, 1e-2, 1e-3):
@@ -126,7 +132,8 @@ def test_the_result_is_within_tolerance_for_more_evaluations_the_tighter(name):
 
 def test_the_last_step_ends_at_the_last_level_itself():
     for problem, tolerance in itertools.product([MIXTURE, GAUSSIAN], [0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.015, 0.01]):
-        network, asked = problem.network(2), []
+        network = problem.network(2)
+        asked = []
         noted = lambda z, timestep: asked.append(float(timestep)) or network(z, timestep)  # noqa: E731, B023
         problem.run(problem.noise(2), tolerance=tolerance, network=noted)
         assert asked[-1] == 0.0 and all(one != other for one, other in itertools.pairwise(asked))
