@@ -59,7 +59,16 @@ def test_others_of_the_class_are_those_of_all_draws():
     for size, share in ((2, 2 / 3), (3, 1 / 3), (4, 0.0)):
         assert metrics.retrieval(query, gallery, labels, torch.tensor([0]), size=size) == pytest.approx(share)
     alike = torch.ones(80, 2)
-    assert metrics.retrieval(alike, alike, LABELS, size=8) == pytest.approx(1 / 8)
+    for first in (1, 5):
+        assert metrics.retrieval(alike, alike, LABELS, size=8, first=first) == pytest.approx(first / 8)
+
+
+def test_several_places_count_where_they_are_asked_for():
+    # Rivals of the query at (1, 0) in the order of their distance; its own sample comes third.
+    gallery = torch.tensor([[1.0, 0.3], [1.0, 0.1], [1.0, -0.2], [0.0, 1.0], [-1.0, 0.0]])
+    query, row, labels = torch.tensor([[1.0, 0.0]]), torch.tensor([0]), torch.zeros(5, dtype=torch.int64)
+    found = [metrics.retrieval(query, gallery, labels, row, size=5, first=first) for first in range(1, 6)]
+    assert found == pytest.approx([0.0, 0.0, 1.0, 1.0, 1.0])
 
 
 def test_mean_average_precision_is_scikit_learns():

@@ -21,8 +21,12 @@ def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
     return F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
 
 
-def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | None = None, *, size: int = 64) -> float:
-    """Expected share of queries that are nearest, by cosine, to their own sample among `size`; chance is 1 / size.
+def retrieval(
+    queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | None = None, *, size: int = 64, first: int = 1
+) -> float:
+    """Expected share of queries whose own sample is among the `first` nearest, by cosine, of `size`.
+
+    Chance is first / size.
 
     The other `size` - 1 samples are of the same class, so no class may have fewer samples. The expectation is over all
     choices of them, so it has no seed. Ties are broken in all ways with equal probability.
@@ -31,6 +35,8 @@ def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | N
         queries, gallery: (Q, D) and (N, D).
         labels: Of the gallery, int64 (N,).
         rows: Row of each query's own sample in the gallery, int64 (Q,); 0, 1, 2 and so on if left out.
+        size: Samples that are ranked, the own one among them.
+        first: Places that count; 1 is the nearest alone.
     """
     rows = torch.arange(len(queries)) if rows is None else rows
     cosine = cosines(queries, gallery)
@@ -43,8 +49,8 @@ def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | N
     probabilities = []
     for nearer_rivals, ties, count in zip(nearer, equal, rivals, strict=True):
         ranked_before = np.arange(nearer_rivals, nearer_rivals + ties + 1)  # for every way that ties are broken
-        none_is_chosen = hypergeom.cdf(0, count, ranked_before, size - 1)
-        probabilities.append(none_is_chosen.mean())
+        fewer_are_chosen = hypergeom.cdf(first - 1, count, ranked_before, size - 1)
+        probabilities.append(fewer_are_chosen.mean())
     return float(np.mean(probabilities))
 
 

@@ -1,0 +1,105 @@
+"""What scanned surfaces are measured by, where the answer is known."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.benchmarks import scans
+from unitouch_gen import weights
+from unitouch_gen.evaluation.controls import others
+from unitouch_gen.models.texture import TextureTrunk
+from unitouch_gen.training.texture import TRUNK
+from unitouch_gen.world.scans import scanned_surfaces
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def wave(down: int, across: int, size: int = 128) -> torch.Tensor:
+    """A grey sine (1, 3, S, S) of so many periods from top to bottom and from left to right."""
+    y, x = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    phase = 2.0 * torch.pi * (down * y + across * x) / size
+    return (0.5 + 0.2 * torch.sin(phase)).expand(1, 3, -1, -1)
+
+
+@pytest.mark.parametrize(("down", "across"), [(0, 6), (2, 10), (10, 22), (-6, 14), (30, 42), (50, 62)])
+def test_a_sine_lights_the_cell_of_its_frequency(down: int, across: int) -> None:
+    # A Hann window spreads a frequency to its two neighbours, which are in the same cell.
+    spectrum = scans.log_spectrum(wave(down, across)).view(32, 16)
+    row, column = divmod(int(spectrum.argmax()), 16)
+    assert (row, column) == (down // 4 % 32, across // 4)
+    away = torch.ones(32, 16, dtype=torch.bool)
+    away[torch.arange(row - 2, row + 3) % 32, max(column - 2, 0) : column + 3] = False
+    assert float(spectrum.max() - spectrum[away].max()) > 5.0
+
+
+def test_a_spectrum_grows_by_the_square_of_contrast_and_ignores_brightness() -> None:
+    images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    once, twice = scans.log_spectrum(images / 4), scans.log_spectrum(images / 2 + 0.1)
+    torch.testing.assert_close(twice - once, torch.full_like(once, 4.0).log(), rtol=1e-3, atol=1e-3)
+
+
+def test_white_noise_has_a_flat_spectrum() -> None:
+    """But for what the mean over 33 pixels takes away, below some four periods."""
+    mean = scans.log_spectrum(0.1 * random(400, 3, 64, 64)).mean(dim=0).view(16, 8)
+    above = mean[4:13]
+    assert float(above.max() - above.min()) < 0.2
+
+
+def test_a_round_holds_one_contact_of_each_surface() -> None:
+    source = scans.scanned_contacts(1000, 1)
+    rounds, names = scans.rounds_of(source), source.surfaces("test")
+    objects, contacts = source.contacts("test")[1:]
+    heldout = {one.group for one in scanned_surfaces() if one.split == "test" and one.heights != "none"}
+    assert rounds.shape == (scans.ROUNDS, len(heldout)) and len(heldout) >= scans.AMONG
+    group_of = {one.name: one.group for one in scanned_surfaces()}
+    assert {group_of[str(names[row])] for row in rounds[0].tolist()} == heldout
+    for surface in rounds.T:
+        assert len({names[row] for row in surface.tolist()}) == 1
+        assert len(objects[surface].unique()) == 1 and contacts[surface].tolist() == list(range(scans.ROUNDS))
+
+
+def test_all_held_out_surfaces_are_seen() -> None:
+    heldout = {one.name for one in scanned_surfaces() if one.split == "test" and one.heights != "none"}
+    assert set(scans.scanned_contacts(1001, 1).surfaces("test")) == heldout
+
+
+def test_controls_of_what_is_found_are_what_they_should_be() -> None:
+    gallery, alike = random(3, 43, 60), torch.ones(2, 43, 60)
+    row = scans.found_row(gallery[:2], gallery, alike, first=5)
+    assert row["value"] == 1.0 and row["chance"] == 5 / 40
+    assert row["class_mean"] == pytest.approx(5 / 40)  # all are equally near
+    assert row["shuffled"] < 0.3 and row["ceiling"] < 0.3
+    assert scans.found_row(gallery[:, others(43)], gallery, gallery)["class_mean"] == 1.0
+
+
+def test_a_linear_relation_is_read() -> None:
+    mixing, source = random(12, 20, seed=1), random(300, 12, seed=2)
+    known, asked = source[:257], source[257:]
+    read, stored = scans.read_linearly((known, 3.0 + known @ mixing), asked, 3.0 + asked @ mixing)
+    assert scans.found_among(read[None], stored[None]) == 1.0
+
+
+def test_the_trunk_of_a_joint_space_is_read_where_it_has_one(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    trunk = TextureTrunk()
+    save_file(
+        {TRUNK + name: values.half() for name, values in trunk.state_dict().items()}, tmp_path / "model.safetensors"
+    )
+    images = torch.rand(1, 3, 32, 32)
+    read = scans.texture_trunk(tmp_path)
+    assert read is not None
+    torch.testing.assert_close(read(images), trunk.half().float()(images))
+    save_file({"touch_model.proj": torch.ones(1)}, tmp_path / "model.safetensors")
+    assert scans.texture_trunk(tmp_path) is None
+
+
+@pytest.mark.slow
+def test_the_built_in_joint_space_is_beside_its_controls(tmp_path: Path) -> None:
+    words = ["--joint", str(weights.JOINT), "--seeds", "1", "--train-objects", "2"]
+    figures = scans.measure(scans.arguments(words), tmp_path)
+    row = figures["rows"]["touch to its touch by a DIGIT, among 40"]
+    assert row["value"] > row["shuffled"] and figures["of"]["recorded"] == {"takes": 20, "kinds": 4, "materials": 4}
