@@ -49,7 +49,8 @@ from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.heldout import FIRST_SEED, world_contacts
 from unitouch_gen.training.texture import TRUNK
-from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Sensor
+from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Sensor, World
+from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.recordings import recordings
 from unitouch_gen.world.scans import scanned_surfaces, surfaces_of
 
@@ -80,9 +81,20 @@ RECORDED = "recorded sound: material"
 # Contacts -------------------------------------------------------------------------------------------------------------
 
 
+class FlatFaces(World):
+    """The same contacts, all of flat faces: edges and bodies would tell them apart whatever their surface."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
+        draws = super().draw(material, object_, contact)
+        return draws.but(shape=torch.full_like(draws.shape, list(SHAPES).index("flat")))
+
+
 @dataclass(frozen=True)
 class TwoSensors(DrawnContacts):
-    """Contacts of a GelSight, each touched by a DIGIT, too."""
+    """Flat contacts of a GelSight, each touched by a DIGIT, too."""
+
+    def world(self, size: int = 128, kind: type[World] = FlatFaces) -> World:
+        return super().world(size, FlatFaces)
 
     def pair(self, split: str, group: int) -> tuple[Sensor, Sensor]:
         return SENSORS["gelsight"], SENSORS["digit"]
