@@ -22,6 +22,7 @@ NOT_RUN = {
     "build_collection": "takes raw surfaces",
     "drawing": "draws for the others",
     "render_inputs": "writes into the checkout",
+    "texture_trunk": "writes weights",
     "watch": "needs a camera",
 }
 

@@ -13,11 +13,13 @@ import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import float_pixels, image_embeddings, in_batches
 from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.joint import stored_tensors
 from unitouch_gen.models.texture import Texture, TextureHead, TextureTrunk
+from unitouch_gen.models.vit import StemmedCLIPVisionModel
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.losses import symmetric_info_nce
@@ -63,8 +65,12 @@ class TextureObjective(nn.Module):
 
     def __init__(self, model: UniTouchModel, losses: TextureLosses, names: Tensor):
         super().__init__()
-        self.image, self.touch = model.vision_model.texture.head, model.touch_model.texture.head
-        self.losses, self.temperature, self.names = losses, model.config.temperature, names
+        pictures, touches = textures_of(model)
+        self.image = pictures.head
+        self.touch = touches.head
+        self.losses = losses
+        self.temperature = model.config.temperature
+        self.names = names
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         image = self.embedded(self.image, batch, "image")
@@ -102,14 +108,27 @@ def name_embeddings(model: UniTouchModel, processor: Any) -> Tensor:
     return F.normalize(torch.stack(per_template).mean(dim=0), dim=1)
 
 
+def textures_of(model: UniTouchModel) -> tuple[Texture, Texture]:
+    """Those of the encoders of image and touch."""
+    vision: Any = model.vision_model
+    touch: Any = model.touch_model
+    return vision.texture, touch.texture
+
+
 def add_texture(model: UniTouchModel, settings: TextureSettings) -> None:
     """Gives the encoders of image and touch the trunk of another joint space, and heads that add nothing yet."""
+    if not isinstance(model.vision_model, StemmedCLIPVisionModel):
+        raise InvalidInputError(
+            "`joint` has a plain CLIP encoder of pictures, which has no place for texture; name one whose "
+            "`vision_config.stem` is 'residual'."
+        )
     tensors = stored_tensors(Path(settings.trunk) if settings.trunk else JOINT)
-    for encoder in (model.vision_model, model.touch_model):
+    encoders: list[Any] = [model.vision_model, model.touch_model]
+    configs: list[Any] = [model.config.vision_config, model.config.touch_config]
+    for encoder, config in zip(encoders, configs, strict=True):
         encoder.texture = Texture(settings.width, model.config.projection_dim)
         trunk = encoder.texture.trunk
         trunk.load_state_dict({name: tensors[TRUNK + name].float() for name in trunk.state_dict()})
-    for config in (model.config.vision_config, model.config.touch_config):
         config.texture_width = settings.width
 
 
@@ -142,10 +161,11 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
     stage.check_drawn(*recipe.objective.model_dump(exclude={"noise"}))
     model = stage.joint_space("image", "text", "touch")
     splits = stage.splits("image", "touch", "text")
+    sources: Any = stage.sources
     columns: dict[str, Any] = {
         "material": torch.cat([split.material for split in splits]),
         "drawn": torch.tensor(
-            [float(surface is None) for source in stage.sources for surface in source.surfaces("train")]
+            [float(surface is None) for source in sources for surface in source.surfaces("train")]
         ),
         "text_embeds": text_embeddings(model, stage.processor, [text for split in splits for text in split.text]),
         "image_embeds": stage.image_embeddings(model, splits),
@@ -153,7 +173,7 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
         "second_embeds": touch_embeddings(stage, model, "second", splits),
     }
     add_texture(model, recipe.model)
-    pictures, touches = model.vision_model.texture, model.touch_model.texture
+    pictures, touches = textures_of(model)
     for name in ("image", "touch", "second"):
         columns[f"{name}_statistics"] = statistics_of(stage, pictures.trunk, name, splits)
     pictures.head.fit(columns["image_statistics"])

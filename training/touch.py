@@ -268,7 +268,8 @@ def main(stage: Stage, recipe: TouchRecipe) -> None:
     if "init" in stage.folders:
         start_from(model, stage.folders["init"])
     elif model.touch_model.texture is not None:
-        model.touch_model.texture.load_state_dict(model.vision_model.texture.state_dict())
+        vision: Any = model.vision_model
+        model.touch_model.texture.load_state_dict(vision.texture.state_dict())  # begins as that of pictures
     set_prototypes(model, splits, reaches=bool(recipe.objective.pairs))
 
     columns: dict[str, Any] = {

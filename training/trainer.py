@@ -80,7 +80,7 @@ def precision_here(wanted: str) -> str:
     """
     if wanted != "bf16" or PartialState().device.type != "cpu":
         return wanted
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # of newer torch
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # of newer torch
     if capabilities.get("architecture") != "x86_64" or capabilities["avx512_bf16"] or capabilities["amx_bf16"]:
         return wanted
     return "no"
