@@ -164,9 +164,7 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
     sources: Any = stage.sources
     columns: dict[str, Any] = {
         "material": torch.cat([split.material for split in splits]),
-        "drawn": torch.tensor(
-            [float(surface is None) for source in sources for surface in source.surfaces("train")]
-        ),
+        "drawn": torch.tensor([float(surface is None) for source in sources for surface in source.surfaces("train")]),
         "text_embeds": text_embeddings(model, stage.processor, [text for split in splits for text in split.text]),
         "image_embeds": stage.image_embeddings(model, splits),
         "touch_embeds": touch_embeddings(stage, model, "touch", splits),
