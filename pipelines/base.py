@@ -145,7 +145,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     # Checks of a call, before any network runs ------------------------------------------------------------------------
 
     def _check_device(self) -> None:
-        if self.device.type == "meta":
+        if self._execution_device.type == "meta":
             raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
 
     def _check_arguments(self, **given: Any) -> SamplingArguments:
@@ -361,7 +361,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 z = scheduler.scale_model_input(latents, timestep)
                 if step > 0:
                     status.update(step - 1, z)
-                if self._interrupt:
+                if end_step is not None and self._interrupt:
                     ended = ReturnCode.INTERRUPTED
                     break
                 prediction = denoise.predict(z, timestep)
@@ -394,7 +394,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self._num_timesteps = total
         report.solver = arguments.solver or "adaptive"
         latents = x
-        begin = sigmas[0]  # noise level that a step begins at
+        begin = sigmas[0]  # noise level at which a step begins
 
         def callback(step: int, x: Tensor, sigma: float) -> Tensor:
             nonlocal latents, begin
@@ -411,7 +411,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 first, last = sigmas
                 done = 100 if sigma <= last else round(100 * math.log(first / sigma) / math.log(first / last))
             bar.update(done - bar.n)
-            if self._interrupt and sigma > 0.0:
+            if end_step is not None and self._interrupt and sigma > 0.0:
                 raise RunInterruptedError
             return x
 

@@ -78,6 +78,23 @@ def test_it_may_interrupt_its_own_call(call, steps):
 
 
 @pytest.mark.parametrize("steps", STEPS)
+def test_an_interrupt_is_of_its_own_call_alone(call, steps):
+    """Not of another one that runs at the same time; here it runs within an evaluation of that."""
+    expected = call.latents(**steps)
+
+    def stop(pipe, step, timestep, tensors):
+        pipe._interrupt = True
+        return {}
+
+    def run_another(unet, args, output):
+        hook.remove()
+        assert call(callback_on_step_end=stop).report.codes == [ReturnCode.INTERRUPTED] * 2
+
+    hook = call.pipe.unet.register_forward_hook(run_another)
+    assert torch.equal(call.latents(**steps), expected)
+
+
+@pytest.mark.parametrize("steps", STEPS)
 def test_a_callback_that_changes_nothing_changes_no_bit(call, steps):
     nothing = lambda pipe, step, timestep, tensors: tensors  # noqa: E731
     assert torch.equal(call.latents(callback_on_step_end=nothing, **steps), call.latents(**steps))
