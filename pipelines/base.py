@@ -94,7 +94,7 @@ def stack_level() -> int:
 
 @dataclass(frozen=True)
 class Touches:
-    """Touches to encode: pixels in [0, 1] (B, 3, S, S), the sensor of each, and the sensors untouched, where given."""
+    """Touches to encode: pixels in [0, 1] (B, 3, S, S), the sensor of each, and optional pictures of it untouched."""
 
     pixels: Tensor
     matches: list[SensorMatch]
@@ -226,7 +226,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         backgrounds = backgrounds.expand_as(pixels)
         matches = sensor_bank.match(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
-            raise InvalidInputError("`background` was given, but this model has no sensor prototypes; leave it out.")
+            raise InvalidInputError("`background` was passed, but this model has no sensor prototypes; leave it out.")
         return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
@@ -590,8 +590,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
 
 
-def check_components(kind: type[DiffusionPipeline], folder: Path, given: Container[str]) -> None:
-    """Raises if a component that model_index.json names, and that is not `given`, lacks files."""
+def check_components(kind: type[DiffusionPipeline], folder: Path, passed: Container[str]) -> None:
+    """Raises if a component that model_index.json names lacks files, unless it was passed."""
     kinds = {
         "tokenizer": "tokenizer",
         "processor": "processor",
@@ -601,7 +601,7 @@ def check_components(kind: type[DiffusionPipeline], folder: Path, given: Contain
     index = kind.load_config(folder)
     for name in kind._get_signature_keys(kind)[0]:
         saved = index.get(name)
-        if isinstance(saved, list | tuple) and saved[1:] != [None] and name not in given:
+        if isinstance(saved, list | tuple) and saved[1:] != [None] and name not in passed:
             check_saved(folder / name, kinds.get(name, "network"))
 
 

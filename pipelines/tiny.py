@@ -100,7 +100,7 @@ def distilled(pipe: Any, folder: Path) -> Any:
     needed("peft")
     if not folder.is_dir():
         raise InvalidInputError(f"{str(folder)!r} is no folder of LoRA weights; make them by `unitouch-gen distill`.")
-    made = copy.copy(pipe)
+    student = copy.copy(pipe)
     unet = copy.deepcopy(pipe.unet)
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
     unet.load_lora_adapter(folder, prefix="unet", use_safetensors=True)
@@ -108,10 +108,10 @@ def distilled(pipe: Any, folder: Path) -> Any:
         raise InvalidInputError(f"{str(folder)!r} holds no LoRA weights of a UNet.")
     unet.fuse_lora()
     unet.unload_lora()
-    made.unet = unet
-    made.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
-    made.register_to_config(**read_settings("folder", folder / "defaults.json"))
-    return made
+    student.unet = unet
+    student.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
+    student.register_to_config(**read_settings("folder", folder / "defaults.json"))
+    return student
 
 
 def joint_space(

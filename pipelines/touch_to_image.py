@@ -174,8 +174,8 @@ class TouchToImagePipeline(UniTouchPipeline):
                 Default: if a bank is present.
             solver: A name in `unitouch_gen.sampling.SOLVERS`; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1; the steps are adaptive.
-            max_evaluations: Maximum network evaluations with a tolerance; default 1000.
-            eta: DDIM eta, from 0 to 1; other solvers ignore it.
+            max_evaluations: Maximum network evaluations, default 1000; applies only with `tolerance`.
+            eta: DDIM eta, from 0 to 1; other schedulers ignore it, and other named solvers refuse it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
             touch_embeds: Embeddings (B, D) in place of `touch`, used unchanged; see `encode_touch`.

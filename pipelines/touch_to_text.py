@@ -99,9 +99,10 @@ class TouchToTextPipeline(UniTouchPipeline):
 
         Args:
             question: One question, or one for each touch; or several about a single touch.
-            max_new_tokens: Most tokens of an answer; default the language model's own, or 128.
+            max_new_tokens: Maximum number of tokens of an answer; default the language model's own, or 128.
             image: Photos in place of `touch`.
-            generator: Seeds what is drawn, and torch's global generator stays as it was; without one, that draws.
+            generator: Seeds the sampling of tokens, and torch's global generator stays as it was. Without one, that one
+                draws them.
             return_dict: Whether to return an output object rather than the tuple (texts, report).
             generate: Options of the language model's `generate`, such as `do_sample`, `temperature`, `num_beams`,
                 `num_return_sequences`, `streamer` or `stopping_criteria`.
@@ -138,10 +139,10 @@ class TouchToTextPipeline(UniTouchPipeline):
                 self.language_bridge.attach(self.language_model, rows),
                 option_errors(generate),
             ):
-                made = self.language_model.generate(ids, attention_mask=mask, generation_config=config, **options)
+                output = self.language_model.generate(ids, attention_mask=mask, generation_config=config, **options)
 
         # 4. Decode them
-        answers = getattr(made, "sequences", made)[:, width:]
+        answers = getattr(output, "sequences", output)[:, width:]
         texts = [text.strip() for text in self.tokenizer.batch_decode(answers, skip_special_tokens=True)]
         ends = {pad, *config.eos_token_id}
         report.tokens = [sum(1 for _ in takewhile(lambda one: one not in ends, row)) for row in answers.tolist()]
@@ -205,29 +206,32 @@ class TouchToTextPipeline(UniTouchPipeline):
         prompts = self.tokenizer(texts, add_special_tokens=not chat)["input_ids"]
         return prompts * count if len(prompts) == 1 else prompts
 
-    def _check_options(self, prompts: list[list[int]], most: int | None, given: dict[str, Any]) -> tuple[Any, dict]:
-        """The configuration of `generate`, with at most `most` new tokens, and its other options."""
-        longest = max(map(len, prompts))
+    def _check_options(
+        self, prompts: list[list[int]], max_new_tokens: int | None, options: dict[str, Any]
+    ) -> tuple[Any, dict]:
+        """The generation config of `generate`, and the options that it does not hold."""
         model = self.language_model
         tokenizer = self.tokenizer
+        longest = max(map(len, prompts))
         free = (getattr(model.config.get_text_config(), "max_position_embeddings", None) or 10**9) - longest
         if free < 1:
             raise InvalidInputError(f"`question` has {longest} tokens, too many for the language model; shorten it.")
         config = copy.deepcopy(model.generation_config)
-        most = min(config.max_new_tokens or 128, free) if most is None else most
-        config.max_new_tokens = check_integer("max_new_tokens", most, 1, free)
-        known = {*vars(config), *inspect.signature(model.generate).parameters}
-        known -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are ours to say
-        for name in given.keys() - known:
-            raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, known)}")
+        if max_new_tokens is None:
+            max_new_tokens = min(config.max_new_tokens or 128, free)
+        config.max_new_tokens = check_integer("max_new_tokens", max_new_tokens, 1, free)
+        names = {*vars(config), *inspect.signature(model.generate).parameters}
+        names -= {"inputs", "generation_config", "kwargs", "max_length"}  # which are set here
+        for name in options.keys() - names:
+            raise InvalidInputError(f"`{name}` is no option of a call or of `generate`. {did_you_mean(name, names)}")
         for name in ("num_beams", "num_return_sequences"):
-            check_integer(name, given.get(name, 1), 1)
-        with option_errors(given):
-            others = config.update(**given)
+            check_integer(name, options.get(name, 1), 1)
+        with option_errors(options):
+            others = config.update(**options)
         ends = tokenizer.eos_token_id if config.eos_token_id is None else config.eos_token_id
         config.eos_token_id = ends if isinstance(ends, list) else [ends]
         pads = (config.pad_token_id, tokenizer.pad_token_id, config.eos_token_id[0])
-        config.pad_token_id = next(one for one in pads if one is not None)
+        config.pad_token_id = next(pad for pad in pads if pad is not None)
         return config, others
 
 

@@ -364,7 +364,7 @@ class XToTouchPipeline(UniTouchPipeline):
         pictures: list[Tensor] = []
         if background is not None:
             if not self.takes_background:
-                raise InvalidInputError("`background` was given, but this model takes none; leave it out.")
+                raise InvalidInputError("`background` was passed, but this model takes none; leave it out.")
             check_unused("background", sensor=sensor)  # a named sensor has its own
             pictures = load_images("background", background)
             labels = [len(names)] * len(pictures)

@@ -64,7 +64,7 @@ def stylize(
     touch_weight: Annotated[
         float | None, Option(min=0, max=1, help="Weight of the touch in the mix, by default 0.7.")
     ] = None,
-    layout: Annotated[int, Option(min=2, help="Cells along a side of the grid that keeps the photo's layout.")] = 14,
+    layout: Annotated[int, options.sampling_option("layout")] = 14,
     keep_colours: Annotated[bool, Option("--keep-colours", metavar="", help="Keep its mean colour, too.")] = False,
     prompt: options.Prompt = None,
     negative_prompt: options.NegativePrompt = None,
