@@ -5,8 +5,9 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+import threading
+from collections.abc import Callable, Container, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
@@ -21,7 +22,6 @@ from diffusers.loaders import StableDiffusionLoraLoaderMixin
 from diffusers.pipelines.pipeline_utils import StableDiffusionMixin
 from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
-from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from unitouch_gen.arguments import MAX_SCALE, SamplingArguments
@@ -71,15 +71,37 @@ SMALL_WORK = 1e10
 The built-in networks stay below it with four rows: two pictures with guidance.
 """
 
-_OPENMP = ThreadpoolController().select(user_api="openmp")
+
+class SingleThread:
+    """A context in which torch computes in the calling thread alone; contexts of several threads may overlap.
+
+    torch has a number for each thread, and one for threads to come. The first context notes that one, all restore it.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.running = 0
+        self.before = 1
+
+    def __enter__(self) -> None:
+        with self.lock:
+            if self.running == 0:
+                self.before = torch.get_num_threads()
+            self.running += 1
+            torch.set_num_threads(1)
+
+    def __exit__(self, *_: object) -> None:
+        with self.lock:
+            self.running -= 1
+            torch.set_num_threads(self.before)
 
 
-@contextmanager
-def threads_for(work: float) -> Iterator[None]:
-    """Limits the calling thread to one thread of OpenMP where there is little work; see `SMALL_WORK`."""
-    torch.get_num_threads()  # torch sets the number of a thread when it is first asked, which would undo the limit
-    with _OPENMP.limit(limits=1 if work < SMALL_WORK else None):
-        yield
+SINGLE_THREAD = SingleThread()
+
+
+def threads_for(work: float) -> AbstractContextManager[None]:
+    """A context for evaluations: one thread where there is little work, otherwise all that torch has."""
+    return SINGLE_THREAD if work < SMALL_WORK else nullcontext()
 
 
 def stack_level() -> int:
@@ -294,8 +316,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             return noise * steps.init_noise_sigma
         return steps.add_noise(init, noise, steps.timesteps[:1].expand(len(init)))
 
-    def _threads(self, shape: Sequence[int], guidance: Guidance) -> Any:
-        """Threads for evaluations on latents (B n, C, h, w); see `threads_for`."""
+    def _threads(self, shape: Sequence[int], guidance: Guidance) -> AbstractContextManager[None]:
+        """`threads_for` evaluations on latents (B n, C, h, w)."""
         samples, _, height, width = shape
         return threads_for(self._num_weights * samples * (1 + guidance.active) * height * width)
 
