@@ -6,6 +6,8 @@
         measures nothing, and writes what is stored to the pages and model cards
     python -m tests.benchmarks --only quality --recordings FOLDER --photos FOLDER
         what the family is worth on the world and on real touches
+    python -m tests.benchmarks --only scans
+        ... and on scanned surfaces and recorded sounds
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -21,6 +23,7 @@ from rich.console import Console
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures, in_turns, machine, quiet, seconds_of
 from tests.benchmarks.quality import quality_figures
+from tests.benchmarks.scans import ROUNDS, scans_figures
 from tests.benchmarks.tables import card_settings, write_pages
 from tests.benchmarks.world import world_figures
 from unitouch_gen import example, weights
@@ -36,6 +39,7 @@ def speed_figures() -> Figures:
 
 PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "quality": lambda given: quality_figures(given.recordings, given.photos, given.seeds),
+    "scans": lambda given: scans_figures(given.seeds, given.each, given.trunk),
     "world": lambda given: world_figures(),
     "speed": lambda given: speed_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
@@ -48,7 +52,17 @@ NEEDED = {"quality": ("recordings",)}
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks")
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
-    parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
+    parser.add_argument("--seeds", type=int, default=3, help="worlds that quality and scans are measured on")
+    parser.add_argument(
+        "--each",
+        type=int,
+        default=ROUNDS,
+        choices=range(1, ROUNDS + 1),
+        help="contacts of each scanned surface to generate of",
+    )
+    parser.add_argument(
+        "--trunk", type=Path, help="folder of the teacher's trunk, where the family's joint space has none"
+    )
     parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `quality`")
     parser.add_argument("--photos", type=Path, help="folder of whole photos, which are restyled")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")

@@ -6,7 +6,7 @@
         a joint space alone
 
 The collection holds out 45 surfaces with heights. Surfaces that may be of one asset count once, which leaves 43 of 15
-materials; glass and rubber have none. Every seed is a world of its own that draws sizes, places and noise of five
+materials; glass and rubber have none. Every seed is a world of its own that draws sizes, places and noise of five flat
 contacts of each. One is found among 40 if it comes first among 40 different surfaces, as expected over all draws of the
 others. Materials are named among all 17, and shares are balanced over the 15.
 """
@@ -426,10 +426,12 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     return {"of": counts, "seeds": seeds, "each": given.each, "rows": figures}
 
 
-def scans_figures(seeds: int, each: int) -> Figures:
+def scans_figures(seeds: int, each: int, trunk: Path | None = None) -> Figures:
     """Figures of the built-in family; images are made of `each` contacts of each surface."""
     words = ["--family", str(weights.FAMILY), "--seeds", str(seeds), "--each", str(each)]
-    with TemporaryDirectory() as scratch:
+    words += [] if trunk is None else ["--trunk", str(trunk)]
+    with TemporaryDirectory() as scratch, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfamiliarInputWarning)
         return measure(arguments(words), Path(scratch))
 
 

@@ -31,7 +31,7 @@ def percent(share: float) -> str:
 # Quality --------------------------------------------------------------------------------------------------------------
 
 ANSWERS = tuple(topic.figure for topic in TOPICS.values() if topic.figure)
-SHARES = ("material", "of the touch", "of the photo", "within 20", *ANSWERS)
+SHARES = ("material", "of the touch", "of the photo", "within 20", "among 40", "spectrum", *ANSWERS)
 """Ends of the names of figures that are shares; others are correlations and distances."""
 
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
@@ -62,12 +62,17 @@ SUMMARY = {
     "touch: material": "material of a touch, zero-shot",
     "image: material": "... of a picture",
     "audio: material": "... of a sound",
+    "recorded sound: material": "... of a recorded sound",
     "touch to its touch by another sensor, within material": "the contact by another sensor, among 50 of its material",
+    "touch to its touch by a DIGIT, among 40": "the contact by a DIGIT, among 40 surfaces",
+    "touch to its picture, among 40": "the picture of a touch, among 40 surfaces",
     "touch to picture: material": "**touch to picture**: material",
     "touch to picture: grain within 20": "... direction of the grain within 20 degrees",
     "touch to picture: contact within material": "... the contact, among 50 of its material",
+    "touch to picture: spectrum": "... spectrum of the true picture, among the first five of 40",
     "photo to touch: material": "**photo to touch**: material",
     "photo to touch: grain within 20": "... direction of the grain within 20 degrees",
+    "photo to touch: spectrum": "... spectrum of the true touch, among the first five of 40",
     "caption to touch: material": "caption to touch: material",
     "word to touch: material": "bare word to touch: material",
     "sound to touch: material": "sound to touch: material",
@@ -78,7 +83,30 @@ SUMMARY = {
     "answer: hard or soft": "... hard or soft (balanced)",
     "answer: contact place": "... where the contact is",
 }
-"""What README.md shows, in its words."""
+"""What README.md shows, in its words: figures of drawn objects, of scanned surfaces, or of both."""
+
+SCANNED = {
+    "image: material": "material of a picture, zero-shot",
+    "touch: material": "... of a touch by a GelSight",
+    "touch by a DIGIT: material": "... of a touch by a DIGIT",
+    "recorded sound: material": "... of a recorded sound",
+    "touch to its picture, among 40": "the picture of a touch by a GelSight, first among 40 surfaces",
+    "touch by a DIGIT to its picture, among 40": "... of a touch by a DIGIT",
+    "touch to its touch by a DIGIT, among 40": "a GelSight's contact by a DIGIT, first among 40 surfaces",
+    "photo to touch: spectrum": "**photo to touch**: spectrum of the true touch, among the first five of 40",
+    "touch to picture: spectrum": "**touch to picture**: spectrum of the true picture, among the first five of 40",
+    "touch to picture: Frechet distance": "... Frechet distance to held-out pictures",
+}
+"""Figures of scanned surfaces and recorded sounds."""
+
+SCANNED_CONTROLS = {
+    "chance": "chance",
+    "class_mean": "class mean",
+    "shuffled": "shuffled",
+    "ceiling": "reference",
+    "reconstruction": "autoencoder",
+    "teacher": "teacher, read linearly",
+}
 
 
 def elsewhere(quality: Figures) -> list[str]:
@@ -96,11 +124,13 @@ def elsewhere(quality: Figures) -> list[str]:
 
 def summary_table(figures: Figures) -> str:
     """Figures of a GelSight's touches beside their controls, and a line each on what is harder."""
-    quality = figures["quality"]
+    quality, scanned = figures["quality"], scanned_rows(figures)
     rows = []
     for name, words in SUMMARY.items():
-        row = quality["rows"][name]
-        rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
+        drawn = quality["rows"].get(name, {})
+        controls = (_shown(name, drawn.get(key)) for key in CONTROLS)
+        of_scans = _shown(name, scanned.get(name, {}).get("value"))
+        rows.append([words, _shown(name, drawn.get("value")), *controls, of_scans])
     lines = elsewhere(quality)
     real = quality["real"]["recordings"]
     lines.append(
@@ -110,8 +140,39 @@ def summary_table(figures: Figures) -> str:
         f"{_deviating(real['statistics'])}, off an untouched gel in {_deviating(real['untouched gel'])}; "
         f"chance {percent(1 / 3)}."
     )
-    head = ["held-out objects, touched by a GelSight", "measured", *CONTROLS.values()]
+    head = ["held out, touched by a GelSight", "drawn objects", *CONTROLS.values(), "scanned surfaces"]
     return table(head, rows, "\n".join(f"- {line}" for line in lines))
+
+
+# Scanned surfaces -----------------------------------------------------------------------------------------------------
+
+
+def scanned_rows(figures: Figures) -> Figures:
+    """Figures of scanned surfaces by name; none where they were not measured."""
+    return figures.get("scans", {}).get("rows", {})
+
+
+def scanned_table(figures: Figures) -> str:
+    """Figures of scanned surfaces and recorded sounds, beside their controls."""
+    found = scanned_rows(figures)
+    rows = []
+    for name, words in SCANNED.items():
+        row = found.get(name, {})
+        value = _shown(name, row.get("value"))
+        if row.get("spread") is not None:
+            value += f" ({_shown(name, row['spread'])})"
+        rows.append([words, value, *(_shown(name, row.get(key)) for key in SCANNED_CONTROLS)])
+    return table(["figure", "measured (spread)", *SCANNED_CONTROLS.values()], rows)
+
+
+def scanned_summary(figures: Figures) -> str:
+    """The same for README.md, less the spread and the autoencoder."""
+    found, controls = scanned_rows(figures), [key for key in SCANNED_CONTROLS if key != "reconstruction"]
+    rows = [
+        [words, *(_shown(name, found.get(name, {}).get(key)) for key in ("value", *controls))]
+        for name, words in SCANNED.items()
+    ]
+    return table(["held-out surfaces, scanned", "measured", *(SCANNED_CONTROLS[key] for key in controls)], rows)
 
 
 def main_table(figures: Figures) -> str:
@@ -282,6 +343,8 @@ def card_settings(figures: Figures) -> dict[str, dict[str, Any]]:
 
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,
+    "scanned summary": scanned_summary,
+    "scanned figures": scanned_table,
     "figures": main_table,
     "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "word to", "sound to"),
     "style figures": lambda figures: quality_table(figures, "photo as it was", "restyled"),

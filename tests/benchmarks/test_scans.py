@@ -50,6 +50,7 @@ def test_white_noise_has_a_flat_spectrum() -> None:
 
 def test_a_round_holds_one_contact_of_each_surface() -> None:
     source = scans.scanned_contacts(1000, 1)
+    assert not source.world().draw(*source.contacts("test")).shape.any()  # all are flat
     rounds, names = scans.rounds_of(source), source.surfaces("test")
     objects, contacts = source.contacts("test")[1:]
     heldout = {one.group for one in scanned_surfaces() if one.split == "test" and one.heights != "none"}
