@@ -11,6 +11,7 @@ from PIL import Image
 
 from unitouch_gen.training.data import heldout
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
+from unitouch_gen.world.scans import scanned_surfaces
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +72,22 @@ def test_the_world_gives_all_of_its_tables(rows_of, models, monkeypatch):
     assert {f"{source}: CVTP, in domain" for source in sources} < set(found["x-to-touch"]) and all(found.values())
 
 
+@pytest.mark.slow
+def test_a_world_of_scanned_surfaces_has_their_materials_alone(rows_of, models, monkeypatch, tmp_path):
+    monkeypatch.setattr(heldout, "OBJECTS", 1)
+    words = ("--model", models["x-to-touch"], "--seeds", "1", "--objects", "2", "--scanned", "1", "--recordings", "0.5")
+    chance = rows_of("material", *words)["chance"]
+    materials = {one.material for one in scanned_surfaces() if one.split == "test" and one.heights != "none"}
+    assert {share for shares in chance.values() for share in shares} == {1 / len(materials)}
+    stored = json.loads((tmp_path / "material.json").read_text())
+    assert (stored["scanned"], stored["recordings"]) == (1.0, 0.5)
+
+
 REFUSED = [  # words of a command, what is changed in the labels, and what is said
     (("taste",), None, "`table` is 'taste'"),
     (("material", "--data", "nowhere"), None, "nowhere"),
+    (("material", "--scanned", "0.5"), None, "`--scanned` is of the world's contacts; leave it out, or `--data`"),
+    (("retrieval", "--recordings", "1"), None, "`--recordings` is of the world's contacts"),
     (("touch-to-image",), None, "holds a XToTouchPipeline; name a saved TouchToImagePipeline"),
     (("material", "--model", "in"), None, "holds no config.json"),
     (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),
@@ -95,6 +109,12 @@ def test_what_cannot_be_measured_is_one_line_before_a_file_is_read(command, mode
         labels = (pictured / "labels.csv").read_text().replace(*change or ("", ""))
         (here / "pictured" / "labels.csv").write_text(labels)
         refused(command("evaluate", "--data", "pictured", "--model", models["x-to-touch"], *words), said)
+
+
+@pytest.mark.parametrize("option", ["--scanned", "--recordings"])
+@pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "half"])
+def test_a_share_is_from_none_to_all(command, refused, option, share):
+    refused(command("evaluate", "material", option, share), option)
 
 
 def test_tables_are_not_replaced_unasked(command, refused, tmp_path):

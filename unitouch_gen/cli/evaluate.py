@@ -13,7 +13,7 @@ from typer import Argument, Option, echo
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number
 from unitouch_gen.files import write_file
 
 TABLES = {
@@ -46,6 +46,8 @@ def evaluate(
     materials: options.Materials = None,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Number of worlds to average over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material in a world.")] = 8,
+    scanned: Annotated[float, Option(min=0, max=1, help="Share of the world's objects that are scanned.")] = 0.0,
+    recordings: Annotated[float, Option(min=0, max=1, help="Share of its sounds that are recorded hits.")] = 0.0,
     each: Annotated[int, Option(min=2, max=10_000, help="Contacts of each material to generate images for.")] = 4,
     cache: Annotated[Path | None, Option(help="Folder for rendered and decoded data.")] = None,
     device: options.Device = "auto",
@@ -56,6 +58,11 @@ def evaluate(
     Example: unitouch-gen evaluate material -o tables/
     """
     check_choice("table", table, TABLES)
+    shares = {"scanned": scanned, "recordings": recordings}
+    for name, share in shares.items():
+        check_number(f"--{name}", share, 0.0, 1.0)
+        if share and data:
+            raise InvalidInputError(f"`--{name}` is of the world's contacts; leave it out, or `--data`.")
     if model is not None and table in PIPELINES:
         kind_of(model, [PIPELINES[table]])
     from unitouch_gen.training.data import open_dataset
@@ -76,12 +83,13 @@ def evaluate(
         else:
             sensors = [name for name in NAMED if name in joint.config.sensors]
             grasps = table == "grasp"
-            sets = of_world(cache_folder, joint, processor, sensors, range(seeds), objects, grasps=grasps)
+            sets = of_world(cache_folder, joint, processor, sensors, range(seeds), objects, grasps=grasps, **shares)
         rows = figures_of(table, sets, joint=joint, processor=processor, pipe=pipe, each=each)
     if output is not None:
         content = {
             "table": table,
             "rows": rows,
+            **({} if data_sets else shares),
             "version": __version__,
             "model": model or "built-in",
             "seconds": round(time.perf_counter() - started),
