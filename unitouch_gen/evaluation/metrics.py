@@ -15,6 +15,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
+FOREIGN_CLASSES = "y_pred contains classes not in y_true"  # scikit-learn's warning; such predictions are wrong ones
+
 
 def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
     """Cosines of queries (Q, D) and a gallery (N, D), float64 (Q, N)."""
@@ -134,6 +136,7 @@ def linear_probe(
     probe = GridSearchCV(make_pipeline(StandardScaler(), regression), grid, scoring=scoring, cv=split)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # early stopping regularises, too
+        warnings.filterwarnings("ignore", message=FOREIGN_CLASSES)
         probe.fit(torch.cat([train, val]).double().numpy(), torch.cat([labels, val_labels]).numpy())
     return torch.from_numpy(probe.predict(test.double().numpy()))
 
@@ -142,5 +145,5 @@ def share_right(predicted: Tensor, labels: Tensor, *, balanced: bool = False) ->
     """Accuracy of classes (N,) against labels (N,); with `balanced` the mean over the labels' classes."""
     score = balanced_accuracy_score if balanced else accuracy_score
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="y_pred contains classes not in y_true")  # which are wrong
+        warnings.filterwarnings("ignore", message=FOREIGN_CLASSES)
         return float(score(labels.cpu().numpy(), predicted.cpu().numpy()))
