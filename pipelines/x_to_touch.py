@@ -224,7 +224,7 @@ class XToTouchPipeline(UniTouchPipeline):
         steps, schedule = prepare_steps(self.scheduler, arguments, self._execution_device)
         report = RunReport(left_out=[f"{name} encoder" for name in MODALITIES if name not in conditions])
 
-        images = arguments.num_images_per_prompt
+        images_each = arguments.num_images_per_prompt
         with self._threads(shape, guidance):
             # 2. Encode the condition and the background
             embeds: Any = condition_embeds
@@ -232,8 +232,8 @@ class XToTouchPipeline(UniTouchPipeline):
                 with report.stage("condition"):
                     embeds = self._encode(conditions, arguments, report)
             embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
-            hidden_states = embeds.to(self.unet.dtype).repeat_interleave(images, dim=0)
-            labels = torch.tensor(sensors, device=self._execution_device).repeat_interleave(images)
+            hidden_states = embeds.to(self.unet.dtype).repeat_interleave(images_each, dim=0)
+            labels = torch.tensor(sensors, device=self._execution_device).repeat_interleave(images_each)
             concat = self._background_latents(backgrounds, labels, shape) if self.takes_background else None
             if guidance.active:  # the unconditional token is zeros
                 hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])

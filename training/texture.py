@@ -1,8 +1,8 @@
-"""Stage 3, texture: what a network that was trained on photos adds to the embeddings of pictures and touches.
+"""Texture: heads that add features of an ImageNet network to the embeddings of pictures and touches.
 
-All encoders and the network stay as they are: what they say of the training data is computed once, and two small heads
-are trained on that (see `unitouch_gen.models.texture`). Scanned surfaces teach them, by the same losses as the stages
-before, and the names of materials; drawn contacts hold the space where it was.
+The encoders and the network are frozen, so their outputs on the training data are computed once. The two heads (see
+`unitouch_gen.models.texture`) are trained by the losses of the earlier stages and by the names of the materials. On
+drawn pictures, the distance to the embedding without texture is penalised, so that the space stays where it was.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings
-from unitouch_gen.training.stages import Recipe, Stage
+from unitouch_gen.training.stages import Recipe, Stage, weights_of
 from unitouch_gen.training.touch import fit_distance
 from unitouch_gen.weights import JOINT
 from unitouch_gen.world import MATERIAL_NAMES
@@ -34,22 +34,26 @@ TEMPLATES = ("{}", "this looks like {}", "this feels like {}")
 
 
 class TextureSettings(Settings):
-    """Sizes of the heads, and whose trunk they stand on."""
+    """Width of the heads, and the trunk in front of them."""
 
-    width: PositiveInt
-    trunk: str | None = None  # folder of a joint space that has one; the built-in one if left out
+    width: PositiveInt  # hidden units of each head
+    trunk: str | None = None  # folder of a joint space to take the trunk from; the built-in one if left out
+
+    @property
+    def trunk_folder(self) -> Path:
+        return JOINT if self.trunk is None else Path(self.trunk)
 
 
 class TextureLosses(Settings):
-    """Weights of losses, and the noise on what they are of."""
+    """Weights of the losses, and the noise on the statistics."""
 
     image: NonNegativeFloat  # InfoNCE of both touches of a contact and its picture (Eq. 2)
-    touch: NonNegativeFloat  # InfoNCE of its touches
-    text: NonNegativeFloat  # InfoNCE of its picture and its caption
-    image_name: NonNegativeFloat  # cross-entropy of the material's name among all, of pictures
-    touch_name: NonNegativeFloat  # and of touches
-    drawn: NonNegativeFloat  # 1 - cosine of the embedding of a drawn picture before and after
-    noise: NonNegativeFloat = 0.0  # deviation of what is added to statistics, in units of theirs
+    touch: NonNegativeFloat  # InfoNCE of the two touches of a contact
+    text: NonNegativeFloat  # InfoNCE of a picture and its caption
+    image_name: NonNegativeFloat  # cross-entropy of a picture's material, against the embeddings of all names
+    touch_name: NonNegativeFloat  # the same of both touches
+    drawn: NonNegativeFloat  # 1 - cosine between the embeddings of a drawn picture with and without texture
+    noise: NonNegativeFloat = 0.0  # standard deviation of the noise, in units of each statistic's own
 
 
 class TextureRecipe(Recipe):
@@ -58,9 +62,9 @@ class TextureRecipe(Recipe):
 
 
 class TextureObjective(nn.Module):
-    """What the heads are trained by, on statistics and on what the encoders say without them.
+    """Losses of the two heads, on precomputed texture statistics and embeddings without texture.
 
-    `names` are unit embeddings of the materials' names (materials, D), in their order.
+    `names` are unit embeddings of the materials' names, (materials, D).
     """
 
     def __init__(self, model: UniTouchModel, losses: TextureLosses, names: Tensor):
@@ -76,64 +80,82 @@ class TextureObjective(nn.Module):
         image = self.embedded(self.image, batch, "image")
         touch = self.embedded(self.touch, batch, "touch")
         second = self.embedded(self.touch, batch, "second")
-        kept = F.cosine_similarity(image, batch["image_embeds"].float(), dim=1)
+        distance = 1.0 - F.cosine_similarity(image, batch["image_embeds"], dim=1)
         bound = symmetric_info_nce(touch, image, self.temperature) + symmetric_info_nce(second, image, self.temperature)
         parts = {
             "image": bound,
             "touch": symmetric_info_nce(touch, second, self.temperature),
             "text": symmetric_info_nce(image, batch["text_embeds"], self.temperature),
-            "image_name": self.named(image, batch["material"]),
-            "touch_name": self.named(touch, batch["material"]) + self.named(second, batch["material"]),
-            "drawn": ((1.0 - kept) * batch["drawn"]).sum() / batch["drawn"].sum().clamp_min(1.0),
+            "image_name": self.name_loss(image, batch["material"]),
+            "touch_name": self.name_loss(touch, batch["material"]) + self.name_loss(second, batch["material"]),
+            "drawn": (distance * batch["drawn"]).sum() / batch["drawn"].sum().clamp_min(1.0),
         }
         loss = torch.stack([getattr(self.losses, name) * part for name, part in parts.items()]).sum()
         return {"loss": loss, **{name: part.detach() for name, part in parts.items()}}
 
     def embedded(self, head: TextureHead, batch: Batch, name: str) -> Tensor:
-        """Embeddings (B, D) with texture of a batch's image, touch or second touch."""
+        """Embeddings (B, D), with texture, of a batch's column "image", "touch" or "second"."""
         statistics = batch[f"{name}_statistics"]
         noise = self.losses.noise * head.deviation * torch.randn_like(statistics)
         return batch[f"{name}_embeds"] + head(statistics + noise)
 
-    def named(self, embeds: Tensor, material: Tensor) -> Tensor:
+    def name_loss(self, embeds: Tensor, material: Tensor) -> Tensor:
+        """Cross-entropy of the materials (B,) of embeddings (B, D) against the embeddings of all names."""
         logits = F.normalize(embeds, dim=1) @ self.names.to(embeds).T / self.temperature
         return F.cross_entropy(logits, material)
 
 
 def name_embeddings(model: UniTouchModel, processor: Any) -> Tensor:
-    """Unit embeddings of the materials' names, (materials, D): means over `TEMPLATES`."""
+    """Unit embeddings of the materials' names, (materials, D), averaged over `TEMPLATES`."""
     per_template = [
         text_embeddings(model, processor, [template.format(name) for name in MATERIAL_NAMES]) for template in TEMPLATES
     ]
     return F.normalize(torch.stack(per_template).mean(dim=0), dim=1)
 
 
-def textures_of(model: UniTouchModel) -> tuple[Texture, Texture]:
-    """Those of the encoders of image and touch."""
+def textures_of(model: UniTouchModel) -> tuple[Any, Any]:
+    """The `Texture`s of the encoders of image and touch; `None` for an encoder without one."""
     vision: Any = model.vision_model
     touch: Any = model.touch_model
-    return vision.texture, touch.texture
+    return getattr(vision, "texture", None), touch.texture
 
 
-def add_texture(model: UniTouchModel, settings: TextureSettings) -> None:
-    """Gives the encoders of image and touch the trunk of another joint space, and heads that add nothing yet."""
+def check_takes_texture(model: UniTouchModel) -> None:
+    """Raises if the encoders of a joint space cannot be given texture."""
     if not isinstance(model.vision_model, StemmedCLIPVisionModel):
         raise InvalidInputError(
             "`joint` has a plain CLIP encoder of pictures, which has no place for texture; name one whose "
             "`vision_config.stem` is 'residual'."
         )
-    tensors = stored_tensors(Path(settings.trunk) if settings.trunk else JOINT)
+    if any(texture is not None for texture in textures_of(model)):
+        raise InvalidInputError("`joint` has texture already; name the joint space that the stage `touch` left.")
+
+
+def read_trunk(folder: Path) -> TextureTrunk | None:
+    """The trunk of a joint space in a folder, in float32; `None` if it has none."""
+    tensors = stored_tensors(folder)
+    if not any(name.startswith(TRUNK) for name in tensors):
+        return None
+    trunk = TextureTrunk()
+    trunk.load_state_dict({name: tensors[TRUNK + name].float() for name in trunk.state_dict()})
+    return trunk
+
+
+def add_texture(model: UniTouchModel, settings: TextureSettings) -> None:
+    """Gives the encoders of image and touch the trunk of another joint space, and heads that add nothing yet."""
+    trunk = read_trunk(settings.trunk_folder)
+    if trunk is None:
+        raise InvalidInputError(f"`model.trunk` is {str(settings.trunk_folder)!r}, which holds no trunk of texture.")
     encoders: list[Any] = [model.vision_model, model.touch_model]
     configs: list[Any] = [model.config.vision_config, model.config.touch_config]
     for encoder, config in zip(encoders, configs, strict=True):
         encoder.texture = Texture(settings.width, model.config.projection_dim)
-        trunk = encoder.texture.trunk
-        trunk.load_state_dict({name: tensors[TRUNK + name].float() for name in trunk.state_dict()})
+        encoder.texture.trunk.load_state_dict(trunk.state_dict())
         config.texture_width = settings.width
 
 
 def touch_embeddings(stage: Stage, model: UniTouchModel, name: str, splits: list[Contacts]) -> Tensor:
-    """Embeddings (N, D) of a column of touches: those of named sensors with their tokens, "second" ones without."""
+    """Embeddings (N, D) of the column "touch", with tokens of its named sensors, or "second", without tokens."""
 
     def compute() -> Tensor:
         parts = [
@@ -145,21 +167,27 @@ def touch_embeddings(stage: Stage, model: UniTouchModel, name: str, splits: list
     return stage.computed_once(f"{name}-embeddings", "joint", splits, compute)
 
 
-def statistics_of(stage: Stage, trunk: TextureTrunk, name: str, splits: list[Contacts]) -> Tensor:
-    """Texture statistics (N, 528) of a column of images."""
+def texture_statistics(trunk: TextureTrunk, images: Any) -> Tensor:
+    """Texture statistics (N, 528) of images (N, 3, S, S), of bytes or in [0, 1]."""
+    return in_batches(len(images), lambda rows: trunk(float_pixels(images[rows])), size=32)
 
-    def of_images(images: Any) -> Tensor:
-        return in_batches(len(images), lambda rows: trunk(float_pixels(images[rows])), size=32)
+
+def cached_statistics(
+    stage: Stage, settings: TextureSettings, trunk: TextureTrunk, name: str, splits: list[Contacts]
+) -> Tensor:
+    """`texture_statistics` of a column of all splits, cached by the weights of the trunk."""
+    trunk_hash = weights_of(settings.trunk_folder)[:16]
 
     def compute() -> Tensor:
-        return torch.cat([of_images(getattr(split, name)) for split in splits])
+        return torch.cat([texture_statistics(trunk, getattr(split, name)) for split in splits])
 
-    return stage.computed_once(f"{name}-texture", "joint", splits, compute)
+    return stage.computed_once(f"{name}-texture-{trunk_hash}", "joint", splits, compute)
 
 
 def main(stage: Stage, recipe: TextureRecipe) -> None:
     stage.check_drawn(*recipe.objective.model_dump(exclude={"noise"}))
     model = stage.joint_space("image", "text", "touch")
+    check_takes_texture(model)
     splits = stage.splits("image", "touch", "text")
     sources: Any = stage.sources
     columns: dict[str, Any] = {
@@ -173,7 +201,7 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
     add_texture(model, recipe.model)
     pictures, touches = textures_of(model)
     for name in ("image", "touch", "second"):
-        columns[f"{name}_statistics"] = statistics_of(stage, pictures.trunk, name, splits)
+        columns[f"{name}_statistics"] = cached_statistics(stage, recipe.model, pictures.trunk, name, splits)
     pictures.head.fit(columns["image_statistics"])
     touches.head.fit(torch.cat([columns["touch_statistics"], columns["second_statistics"]]))
 

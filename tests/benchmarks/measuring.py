@@ -1,14 +1,19 @@
 """What several benchmarks measure with: calls that take turns, and contacts of the world."""
 
+import argparse
+import json
 import platform
 import statistics
 import time
+import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from rich.console import Console
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 from sklearn.pipeline import make_pipeline
@@ -16,6 +21,8 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 from torchmetrics.functional.regression import pearson_corrcoef
 
+from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.files import write_file
 from unitouch_gen.pipelines.tiny import tiny
 
 Figures = dict[str, Any]
@@ -101,3 +108,16 @@ def machine() -> str:
     count = torch.get_num_threads()
     threads = "1 thread" if count == 1 else f"{count} threads"
     return f"{(names or [platform.machine()])[0]}, {threads}, torch {torch.__version__}"
+
+
+def print_figures(given: argparse.Namespace, measure: Callable[[argparse.Namespace, Path], Figures]) -> None:
+    """What a benchmark's command does: prints what `measure(given, cache)` returns, and writes it to `given.output`.
+
+    `given.cache` is where contacts are rendered to; a folder that is removed if it is `None`.
+    """
+    warnings.simplefilter("ignore", UnfamiliarInputWarning)  # of sensors drawn anew and of scanned surfaces
+    with TemporaryDirectory() as scratch:
+        figures = measure(given, given.cache or Path(scratch))
+    if given.output is not None:
+        write_file("output", given.output, json.dumps(figures, indent=2) + "\n")
+    Console(width=160, soft_wrap=True).print_json(data=figures)

@@ -12,8 +12,6 @@ Every seed is a world of its own, with objects, sensors and noise of its own. Fi
 """
 
 import argparse
-import json
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,20 +23,24 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from rich.console import Console
 from torch import Tensor
 
 from tests.benchmarks.clips import GELSIGHT, Clips, square_pixels
 from tests.benchmarks.joint_space import JointSpace, agreed, found_within, held_out, material_rows
-from tests.benchmarks.measuring import Figures, attribute_agreement, cross_predicted, over_seeds, quiet
+from tests.benchmarks.measuring import (
+    Figures,
+    attribute_agreement,
+    cross_predicted,
+    over_seeds,
+    print_figures,
+    quiet,
+)
 from unitouch_gen import weights
-from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.answers import caption_table
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
 from unitouch_gen.evaluation.controls import class_means, statistics, untrained_like, with_controls
 from unitouch_gen.evaluation.generated import beside_class_means, generate, sample_per_class
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
-from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.joint import UNLIKE, UNTOUCHED
@@ -370,13 +372,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    given = arguments(words)
-    warnings.simplefilter("ignore", UnfamiliarInputWarning)  # which sensors drawn anew are
-    with TemporaryDirectory() as scratch:
-        figures = measure(given, given.cache or Path(scratch))
-    if given.output is not None:
-        write_file("output", given.output, json.dumps(figures, indent=2) + "\n")
-    Console(width=160, soft_wrap=True).print_json(data=figures)
+    print_figures(arguments(words), measure)
 
 
 if __name__ == "__main__":

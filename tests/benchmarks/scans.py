@@ -12,7 +12,6 @@ others. Materials are named among all 17, and shares are balanced over the 15.
 """
 
 import argparse
-import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
 from sklearn.linear_model import RidgeCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -32,7 +30,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from tests.benchmarks.joint_space import JointSpace
-from tests.benchmarks.measuring import Figures, over_seeds, quiet
+from tests.benchmarks.measuring import Figures, over_seeds, print_figures, quiet
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, float_pixels, in_batches
@@ -40,15 +38,13 @@ from unitouch_gen.evaluation.controls import class_means, others
 from unitouch_gen.evaluation.generated import generate
 from unitouch_gen.evaluation.metrics import cosines, frechet_distance, linear_probe, retrieval, share_right
 from unitouch_gen.evaluation.zero_shot import PROMPTS
-from unitouch_gen.files import write_file
 from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import local_mean
-from unitouch_gen.models.joint import stored_tensors
 from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.heldout import FIRST_SEED, world_contacts
-from unitouch_gen.training.texture import TRUNK
+from unitouch_gen.training.texture import read_trunk, texture_statistics
 from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Sensor, World
 from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.recordings import recordings
@@ -136,22 +132,8 @@ def see(joint: JointSpace, trunk: TextureTrunk | None, contacts: Contacts) -> Se
         images = getattr(contacts, column)
         seen.embeds[column] = joint.features(encoder, images)
         if trunk is not None:
-            seen.statistics[column] = trunk_statistics(trunk, images)
+            seen.statistics[column] = texture_statistics(trunk, images)
     return seen
-
-
-def texture_trunk(folder: Path) -> TextureTrunk | None:
-    """The network trained on photos that a joint space's encoders stand on, or `None` of a space without one."""
-    tensors, trunk = stored_tensors(folder), TextureTrunk()
-    if not any(name.startswith(TRUNK) for name in tensors):
-        return None
-    trunk.load_state_dict({name: tensors[TRUNK + name].float() for name in trunk.state_dict()})
-    return trunk
-
-
-def trunk_statistics(trunk: TextureTrunk, images: Any) -> Tensor:
-    """Texture statistics (N, 528) of uint8 images (N, 3, S, S)."""
-    return in_batches(len(images), lambda rows: trunk(float_pixels(images[rows])), size=32)
 
 
 # What the joint space knows -------------------------------------------------------------------------------------------
@@ -381,7 +363,7 @@ def frechet_row(classifier: ContactClassifier, pictures: Mapping[str, Tensor], r
 
 def measure(given: argparse.Namespace, cache: Path) -> Figures:
     """All that can be measured of a joint space, or of a family."""
-    joint, trunk = JointSpace.from_folder(given.joint), texture_trunk(given.trunk or given.joint)
+    joint, trunk = JointSpace.from_folder(given.joint), read_trunk(given.trunk or given.joint)
     if trunk is None:
         print("Left out: the teacher's features, as this joint space has no trunk (--trunk FOLDER).", flush=True)
     pipes = {name: quiet(one.pipeline, family=given.family) for name, one in MADE.items() if given.family}
@@ -459,13 +441,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    given = arguments(words)
-    warnings.simplefilter("ignore", UnfamiliarInputWarning)  # of touches of surfaces that nothing was trained on
-    with TemporaryDirectory() as scratch:
-        figures = measure(given, given.cache or Path(scratch))
-    if given.output is not None:
-        write_file("output", given.output, json.dumps(figures, indent=2) + "\n")
-    Console(width=160, soft_wrap=True).print_json(data=figures)
+    print_figures(arguments(words), measure)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ import torch
 from tests.benchmarks import scans
 from unitouch_gen import weights
 from unitouch_gen.evaluation.controls import others
-from unitouch_gen.models.texture import TextureTrunk
-from unitouch_gen.training.texture import TRUNK
 from unitouch_gen.world.scans import scanned_surfaces
 
 
@@ -81,21 +79,6 @@ def test_a_linear_relation_is_read() -> None:
     known, asked = source[:257], source[257:]
     read, stored = scans.read_linearly((known, 3.0 + known @ mixing), asked, 3.0 + asked @ mixing)
     assert scans.found_among(read[None], stored[None]) == 1.0
-
-
-def test_the_trunk_of_a_joint_space_is_read_where_it_has_one(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    trunk = TextureTrunk()
-    save_file(
-        {TRUNK + name: values.half() for name, values in trunk.state_dict().items()}, tmp_path / "model.safetensors"
-    )
-    images = torch.rand(1, 3, 32, 32)
-    read = scans.texture_trunk(tmp_path)
-    assert read is not None
-    torch.testing.assert_close(read(images), trunk.half().float()(images))
-    save_file({"touch_model.proj": torch.ones(1)}, tmp_path / "model.safetensors")
-    assert scans.texture_trunk(tmp_path) is None
 
 
 @pytest.mark.slow

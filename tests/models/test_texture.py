@@ -5,12 +5,15 @@ from pathlib import Path
 import pytest
 import torch
 from efficientnet_lite_pytorch import EfficientNet
+from safetensors.torch import save_file
 from texture_trunk import folded, published_weights
 
 from tests.helpers.components import clip_tokenizer, joint_config
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import denormalise_pixels
 from unitouch_gen.models.texture import DESCRIBED, TextureTrunk
+from unitouch_gen.training.texture import TRUNK, check_takes_texture, read_trunk
 from unitouch_gen.training.touch import LossWeights, TouchEncoder
 
 
@@ -72,3 +75,23 @@ def test_a_trunk_learns_nothing() -> None:
     for encoder in (model.vision_model, model.touch_model):
         assert not any(weight.requires_grad for weight in encoder.texture.trunk.parameters())
         assert all(weight.requires_grad for weight in encoder.texture.head.parameters())
+
+
+def test_the_trunk_of_a_joint_space_is_read_where_it_has_one(tmp_path: Path) -> None:
+    trunk = TextureTrunk()
+    save_file(
+        {TRUNK + name: values.half() for name, values in trunk.state_dict().items()}, tmp_path / "model.safetensors"
+    )
+    images = torch.rand(1, 3, 32, 32)
+    read = read_trunk(tmp_path)
+    assert read is not None
+    torch.testing.assert_close(read(images), trunk.half().float()(images))
+    save_file({"touch_model.proj": torch.ones(1)}, tmp_path / "model.safetensors")
+    assert read_trunk(tmp_path) is None
+
+
+def test_texture_is_refused_where_it_has_no_place_or_is_there_already() -> None:
+    with pytest.raises(InvalidInputError, match="`joint` has texture already"):
+        check_takes_texture(with_texture())
+    with pytest.raises(InvalidInputError, match="`joint` has a plain CLIP encoder"):
+        check_takes_texture(UniTouchModel(joint_config(clip_tokenizer())))
