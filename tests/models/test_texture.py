@@ -12,7 +12,7 @@ from tests.helpers.components import clip_tokenizer, joint_config
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import denormalise_pixels
-from unitouch_gen.models.texture import DESCRIBED, TextureTrunk
+from unitouch_gen.models.texture import TAPPED, TextureTrunk
 from unitouch_gen.training.texture import TRUNK, check_takes_texture, read_trunk
 from unitouch_gen.training.touch import LossWeights, TouchEncoder
 
@@ -27,9 +27,9 @@ def test_the_trunk_is_the_published_network(size: int) -> None:
     with torch.no_grad():
         x = published._swish(published._bn0(published._conv_stem((images * 255 - 127) / 128)))
         expected = []
-        for number, block in enumerate(published._blocks[: DESCRIBED[-1] + 1]):
+        for number, block in enumerate(published._blocks[: TAPPED[-1] + 1]):
             x = block(x)
-            expected += [x] if number in DESCRIBED else []
+            expected += [x] if number in TAPPED else []
         layers = trunk.layers(images)
         statistics = trunk(images)
     for ours, theirs in zip(layers, expected, strict=True):

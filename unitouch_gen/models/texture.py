@@ -1,9 +1,9 @@
-"""What a network that was trained on photos says of the texture of an image, for the encoders of image and touch.
+"""Texture features of an ImageNet network, which the encoders of image and touch add to their embeddings.
 
 The trunk is EfficientNet-Lite0 (Tan & Le, 2019, "EfficientNet: Rethinking model scaling for convolutional neural
-networks"; "Lite" leaves out squeeze-and-excitation and clips activations at 6) up to its eleventh block, where an image
-of 128 pixels has 8 x 8 places. Means and deviations of three of its layers describe a texture wherever it lies (after
-Gatys et al., 2015, "Texture synthesis using convolutional neural networks", who take all covariances).
+networks"; "Lite" has no squeeze-and-excitation and clips activations at 6) up to its eleventh block, whose output is
+8 x 8 for an image of 128 pixels. The features are the spatial means and standard deviations of three layers, as texture
+is stationary (Gatys et al., 2015, "Texture synthesis using convolutional neural networks", take all covariances).
 """
 
 import torch
@@ -15,24 +15,26 @@ from unitouch_gen.models.images import denormalise_pixels
 STAGES = ((16, 3, 1, 1, 1), (24, 3, 2, 6, 2), (40, 5, 2, 6, 2), (80, 3, 2, 6, 3), (112, 5, 1, 6, 3))
 """Channels, kernel, stride, expansion and number of the blocks of each stage."""
 
-DESCRIBED = (4, 8, 10)
-"""Blocks whose outputs are described: the fifth, ninth and eleventh, of 40, 112 and 112 channels."""
+TAPPED = (4, 8, 10)
+"""Indices of the blocks whose outputs are taken: of 40, 112 and 112 channels."""
 
 STATISTICS = 2 * (40 + 112 + 112)
+"""Number of features: a mean and a standard deviation of each channel."""
 
 
 class SamePadded(nn.Conv2d):
-    """A convolution of TensorFlow: what padding an odd number of pixels needs is put behind and below."""
+    """A convolution with TensorFlow's "same" padding: of an odd number of pixels, the larger half is at the end."""
 
     def forward(self, x: Tensor) -> Tensor:
-        kernel, stride = self.kernel_size[0], self.stride[0]
+        kernel = self.kernel_size[0]
+        stride = self.stride[0]
         rows, columns = (max((-(-side // stride) - 1) * stride + kernel - side, 0) for side in x.shape[-2:])
         padded = F.pad(x, (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2))
         return super().forward(padded)
 
 
 class InvertedResidual(nn.Module):
-    """Expansion, depthwise convolution and projection (Sandler et al., 2018, "MobileNetV2"), norms folded into them."""
+    """An inverted residual block (Sandler et al., 2018, "MobileNetV2"), with batch norms folded into convolutions."""
 
     def __init__(self, channels: int, out_channels: int, kernel: int, stride: int, expansion: int):
         super().__init__()
@@ -49,7 +51,7 @@ class InvertedResidual(nn.Module):
 
 
 class TextureTrunk(nn.Module):
-    """Texture statistics (B, 528) of raw images (B, 3, H, W) in [0, 1]; frozen."""
+    """The frozen network: images (B, 3, H, W) in [0, 1] -> texture statistics (B, 528)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,12 +66,12 @@ class TextureTrunk(nn.Module):
         self.requires_grad_(False)
 
     def layers(self, images: Tensor) -> list[Tensor]:
-        """Outputs (B, C, h, w) of the `DESCRIBED` blocks."""
-        x = F.relu6(self.stem((images * 255.0 - 127.0) / 128.0))  # as it was trained
+        """Outputs (B, C, h, w) of the `TAPPED` blocks."""
+        x = F.relu6(self.stem((images * 255.0 - 127.0) / 128.0))  # the normalisation it was trained with
         outputs = []
         for number, block in enumerate(self.blocks):
             x = block(x)
-            if number in DESCRIBED:
+            if number in TAPPED:
                 outputs.append(x)
         return outputs
 
@@ -81,9 +83,9 @@ class TextureTrunk(nn.Module):
 
 
 class TextureHead(nn.Module):
-    """What texture adds to an embedding, (B, 528) -> (B, D): nothing at first, as its last layer begins at zero.
+    """A two-layer perceptron, (B, 528) -> (B, D). Its output layer is initialised to zero, so it adds nothing at first.
 
-    Statistics are brought to the mean and deviation that they have over the training data, which `fit` stores.
+    Statistics are standardised by the mean and deviation of the training data, which `fit` stores.
     """
 
     mean: Tensor
@@ -109,7 +111,7 @@ class TextureHead(nn.Module):
 
 
 class Texture(nn.Module):
-    """Trunk and head: what the texture of images adds to their embeddings, (B, 3, H, W) normalised -> (B, D).
+    """Trunk and head: normalised images (B, 3, H, W) -> what is added to their embeddings, (B, D).
 
     Args:
         width: Hidden units of the head.
