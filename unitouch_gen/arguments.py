@@ -1,7 +1,7 @@
 """Arguments of sampling, with kinds, bounds and defaults, for calls of pipelines, the command line and the page."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -54,3 +54,11 @@ class SamplingArguments(BaseModel):
     # Results
     output_type: Literal["pil", "np", "pt", "latent"] = "pil"
     throw: bool = True
+
+
+def bounds(name: str) -> tuple[Any, Any]:
+    """Smallest and largest value of a sampling argument; `None` where it has no bound."""
+    constraints = SamplingArguments.model_fields[name].metadata
+    low = next((one.ge for one in constraints if hasattr(one, "ge")), None)
+    high = next((one.le for one in constraints if hasattr(one, "le")), None)
+    return low, high

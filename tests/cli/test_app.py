@@ -198,8 +198,8 @@ def test_a_large_upload_is_refused_in_a_line_and_leaves_nothing(visitor, tmp_pat
         ("Pictures", 100, "num_images_per_prompt"),
         ("Steps", 0, "num_inference_steps"),
         ("Guidance", "much", "guidance_scale"),
-        ("Error", 7, "tolerance"),
-        ("Error", -1, "tolerance"),
+        ("Tolerance", 7, "tolerance"),
+        ("Tolerance", -1, "tolerance"),
         ("Sensor", "no such sensor", "sensor"),
     ],
 )

@@ -87,14 +87,14 @@ def test_a_photo_is_restyled_and_what_is_missing_is_told(page):
 
 def test_settings_that_are_opened_and_left_as_they_are_change_nothing(page):
     upload(page, "Touch", str(example("brick")))
-    page.get_by_text("Solver, seed, number of pictures").locator("visible=true").click()
+    page.get_by_text("Sampling").locator("visible=true").click()
     page.get_by_label("Seed; a new one each time if empty").locator("visible=true").wait_for()
     assert "2 steps" in make(page)
 
 
 def test_stop_leaves_no_error(page):
     upload(page, "Touch", str(example("brick")))
-    page.get_by_text("Solver, seed, number of pictures").locator("visible=true").click()
+    page.get_by_text("Sampling").locator("visible=true").click()
     steps = page.get_by_label("number input for Steps").locator("visible=true")
     steps.fill("50")
     steps.blur()

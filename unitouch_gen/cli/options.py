@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Context, Option
 
-from unitouch_gen.arguments import SamplingArguments
+from unitouch_gen.arguments import SamplingArguments, bounds
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import check_writable
 
@@ -26,9 +26,8 @@ SEVERAL = "files, folders, patterns or example:NAME"
 
 def sampling_option(name: str, *flags: str) -> Any:
     """The option of a sampling argument, with its bounds and its description."""
-    field = SamplingArguments.model_fields[name]
-    bounds = {key: getattr(one, key) for one in field.metadata for key in ("ge", "le") if hasattr(one, key)}
-    return Option(*flags, min=bounds.get("ge"), max=bounds.get("le"), help=field.description)
+    low, high = bounds(name)
+    return Option(*flags, min=low, max=high, help=SamplingArguments.model_fields[name].description)
 
 
 # Inputs and outputs

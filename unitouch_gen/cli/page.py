@@ -17,6 +17,7 @@ from gradio import processing_utils
 from gradio.utils import get_upload_folder
 from transformers import StoppingCriteriaList
 
+from unitouch_gen.arguments import SamplingArguments, bounds
 from unitouch_gen.cli.options import MAX_SEED
 from unitouch_gen.errors import InvalidInputError, check_integer, check_number, first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
@@ -228,7 +229,7 @@ def values_of(fields: Fields, inputs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def touch_fields(pipe: Any) -> Fields:
-    sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.config.sensors)]
+    sensors = [("retrieved from the image", ""), *((name, name) for name in pipe.unitouch.config.sensors)]
     return {
         "touch": upload("touch", "Touch"),
         "prompt": gradio.Textbox("", label="Prompt", info="What else the picture should be.", max_lines=3),
@@ -240,9 +241,9 @@ def style_fields(pipe: Any) -> Fields:
     return {
         "image": upload("image", "Photo"),
         **touch_fields(pipe),
-        "touch_weight": gradio.Slider(0, 1, 0.7, step=0.05, label="Share of the touch in the mix"),
-        "layout": gradio.Slider(2, 16, 14, step=1, label="How finely the photo's layout is held"),
-        "keep_colours": gradio.Checkbox(False, label="Hold its mean colour, too"),
+        "touch_weight": slider("touch_weight", "Touch weight", 0.7, most=1, step=0.05),
+        "layout": slider("layout", "Layout", 14, most=16),
+        "keep_colours": gradio.Checkbox(False, label="Keep colours", info=description("keep_colours")),
     }
 
 
@@ -291,19 +292,32 @@ def solver_fields(pipe: Any) -> Fields:
     """Fields of all tabs with pictures."""
     steps = pipe.config.default_num_inference_steps
     guidance = pipe.config.default_guidance_scale
-    with gradio.Accordion("Solver, seed, number of pictures", open=False):
+    with gradio.Accordion("Sampling", open=False):
         return {
-            "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
-            # gradio shows 0 even if there is no value.
+            "num_inference_steps": slider("num_inference_steps", "Steps", steps, most=max(2 * steps, 50)),
             "tolerance": gradio.Number(
-                0, label="Error of the latents, in place of steps if above 0", minimum=0, maximum=1
+                0,  # gradio shows 0 even if there is no value
+                label="Tolerance",
+                info=f"{description('tolerance')} 0 for a number of steps.",
+                minimum=0,
+                maximum=bounds("tolerance")[1],
             ),
-            "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
-            "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
+            "guidance_scale": slider("guidance_scale", "Guidance", guidance, most=max(2 * guidance, 15), step=0.5),
+            "num_images_per_prompt": slider("num_images_per_prompt", "Pictures", 1, most=8),
             "seed": gradio.Number(
                 0, precision=0, minimum=0, maximum=MAX_SEED, label="Seed; a new one each time if empty"
             ),
         }
+
+
+def slider(name: str, label: str, value: float, *, most: float, step: float = 1) -> gradio.Slider:
+    """A slider of a sampling argument, from its smallest value to the largest that the page offers."""
+    return gradio.Slider(bounds(name)[0], most, value, step=step, label=label, info=description(name))
+
+
+def description(name: str) -> str | None:
+    """What a sampling argument is."""
+    return SamplingArguments.model_fields[name].description
 
 
 def answer(
