@@ -16,7 +16,6 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import in_batches
 from unitouch_gen.models.autoencoders import (
     Autoencoder,
     autoencoder_class,
@@ -25,6 +24,7 @@ from unitouch_gen.models.autoencoders import (
     read_autoencoder,
     scale_factor,
 )
+from unitouch_gen.models.features import in_batches
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.vit import Residual
 from unitouch_gen.training.batches import ArrayDataset, Batch

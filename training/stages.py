@@ -22,9 +22,9 @@ from typer import Option
 
 from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import image_embeddings
 from unitouch_gen.files import check_writable, files_below, is_hidden
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.features import image_embeddings
 from unitouch_gen.saving import filling
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.checkpoints import checkpoints_in, read_progress

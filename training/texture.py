@@ -14,9 +14,8 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import float_pixels, image_embeddings, in_batches
-from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.features import float_pixels, image_embeddings, in_batches, text_embeddings
 from unitouch_gen.models.joint import stored_tensors
 from unitouch_gen.models.texture import Texture, TextureHead, TextureTrunk
 from unitouch_gen.models.vit import StemmedCLIPVisionModel

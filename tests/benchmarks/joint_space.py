@@ -14,12 +14,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, attribute_agreement
-from unitouch_gen.evaluation.contacts import Contacts, image_embeddings
 from unitouch_gen.evaluation.controls import class_means, with_controls
 from unitouch_gen.evaluation.metrics import retrieval, share_right
-from unitouch_gen.evaluation.zero_shot import PROMPTS, text_embeddings
+from unitouch_gen.evaluation.zero_shot import PROMPTS
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.features import image_embeddings, text_embeddings
 from unitouch_gen.training.data import DrawnContacts
+from unitouch_gen.training.data.contacts import Contacts
 from unitouch_gen.training.data.heldout import world_contacts
 from unitouch_gen.world import MATERIAL_NAMES
 

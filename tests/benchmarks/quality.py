@@ -37,15 +37,16 @@ from tests.benchmarks.measuring import (
 )
 from unitouch_gen import weights
 from unitouch_gen.evaluation.answers import caption_table
-from unitouch_gen.evaluation.contacts import Contacts, float_pixels
 from unitouch_gen.evaluation.controls import class_means, statistics, untrained_like, with_controls
 from unitouch_gen.evaluation.generated import beside_class_means, generate, sample_per_class
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
 from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.models.features import float_pixels
 from unitouch_gen.models.images import centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.joint import UNLIKE, UNTOUCHED
 from unitouch_gen.models.relief import relief
 from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
+from unitouch_gen.training.data.contacts import Contacts
 from unitouch_gen.training.data.heldout import FIRST_SEED
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.attributes import gaussian_blur

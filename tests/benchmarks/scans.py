@@ -33,16 +33,17 @@ from tests.benchmarks.joint_space import JointSpace
 from tests.benchmarks.measuring import Figures, over_seeds, print_figures, quiet
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
-from unitouch_gen.evaluation.contacts import SPLITS, Contacts, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import class_means, others
 from unitouch_gen.evaluation.generated import generate
 from unitouch_gen.evaluation.metrics import cosines, frechet_distance, linear_probe, retrieval, share_right
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.models.features import float_pixels, in_batches
 from unitouch_gen.models.images import local_mean
 from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.training.data import DrawnContacts
+from unitouch_gen.training.data.contacts import SPLITS, Contacts
 from unitouch_gen.training.data.heldout import FIRST_SEED, world_contacts
 from unitouch_gen.training.texture import read_trunk, texture_statistics
 from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Sensor, World

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from unitouch_gen.evaluation.answers import caption_table, measured
-from unitouch_gen.evaluation.contacts import Contacts
+from unitouch_gen.training.data.contacts import Contacts
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.attributes import ATTRIBUTES
 from unitouch_gen.world.questions import asked_of

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from transformers import ResNetConfig
 
-from unitouch_gen.evaluation.contacts import SPLITS, Contacts
 from unitouch_gen.evaluation.generated import beside_class_means, measures_of, sample_per_class
 from unitouch_gen.evaluation.tables import TEMPLATES, grasp_table, material_table, prompts_table, retrieval_table
 from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.training.data.contacts import SPLITS, Contacts
 from unitouch_gen.world import ATTRIBUTES
 
 NAMES = ("brick", "grass", "leather", "wood")

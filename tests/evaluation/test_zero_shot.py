@@ -7,8 +7,9 @@ from scipy.special import softmax
 
 from tests.helpers.components import make_components
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.evaluation.zero_shot import PROMPTS, Named, ZeroShotTouchClassifier, text_embeddings
+from unitouch_gen.evaluation.zero_shot import PROMPTS, Named, ZeroShotTouchClassifier
 from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.models.features import text_embeddings
 from unitouch_gen.world import MATERIAL_NAMES
 
 NAMES = ("brick", "glass", "grass", "wood", "leather")

@@ -17,11 +17,11 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, check_file
-from unitouch_gen.evaluation.contacts import Contacts
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.models.sounds import LogMel
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
+from unitouch_gen.training.data.contacts import Contacts
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Relit
 from unitouch_gen.training.data.records import Record, abbreviate
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed, float_pixels
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.models.features import float_pixels
 from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, relit, sound_of
+from unitouch_gen.training.data.contacts import SPLITS, Contacts, Splits
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.records import Record
 from unitouch_gen.training.data.sets import RecordSet
-from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE
 from unitouch_gen.world.questions import TOPICS, asked_of
 
@@ -93,14 +92,21 @@ def tenth_of_each_material(data: RecordSet) -> RecordSet:
     return replace(data, records=tuple(chosen), chosen="val, a tenth of train")
 
 
-Sets = Iterator[tuple[str, bool, int, Splits]]
-"""Names of sensors or data sets, whether the model knows the sensor, seeds, and contacts with features by split."""
+Sets = Iterator[tuple[str, int, Splits]]
+"""Names of sensors or data sets, seeds, and contacts by split."""
 
 
 def of_world(
-    cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sensors: Sequence[str], seeds: Sequence[int],
-    objects: int, *, grasps: bool = False, scanned: float = 0.0, recordings: float = 0.0,
-) -> Sets:  # fmt: skip
+    cache: Path,
+    processor: UniTouchProcessor,
+    sensors: Sequence[str],
+    seeds: Sequence[int],
+    objects: int,
+    *,
+    grasps: bool = False,
+    scanned: float = 0.0,
+    recordings: float = 0.0,
+) -> Sets:
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material.
 
     Shares of the objects are scanned, and of the sounds recorded, as in `DrawnContacts`.
@@ -110,20 +116,11 @@ def of_world(
             0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects, scanned=scanned, recordings=recordings
         )
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
-        embed_all(model, processor, splits)
-        yield sensor or "sensors drawn anew", sensor in model.config.sensors, source.seed, splits
+        yield sensor or "sensors drawn anew", source.seed, splits
 
 
-def of_datasets(cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
+def of_datasets(cache: Path, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
     """Data sets, each in all of its splits."""
     for data in sets:
         splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
-        embed_all(model, processor, splits)
-        yield data.name, {record.sensor for record in data.records} <= {*model.config.sensors}, 0, splits
-
-
-def embed_all(model: UniTouchModel, processor: UniTouchProcessor, splits: Splits) -> None:
-    """Gives contacts their features."""
-    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
-    for contacts in splits.values():
-        contacts.features = embed(model, processor, contacts, classifier)
+        yield data.name, 0, splits

@@ -79,11 +79,11 @@ def evaluate(
         cache_folder = cache or Path(scratch)
         started = time.perf_counter()
         if data_sets:
-            sets = of_datasets(cache_folder, joint, processor, data_sets)
+            sets = of_datasets(cache_folder, processor, data_sets)
         else:
             sensors = [name for name in NAMED if name in joint.config.sensors]
             grasps = table == "grasp"
-            sets = of_world(cache_folder, joint, processor, sensors, range(seeds), objects, grasps=grasps, **shares)
+            sets = of_world(cache_folder, processor, sensors, range(seeds), objects, grasps=grasps, **shares)
         rows = figures_of(table, sets, joint=joint, processor=processor, pipe=pipe, each=each)
     if output is not None:
         content = {
@@ -163,8 +163,9 @@ def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, eac
     from unitouch_gen import weights
     from unitouch_gen.evaluation import generated, tables
     from unitouch_gen.evaluation.answers import caption_table
-    from unitouch_gen.evaluation.zero_shot import text_embeddings
+    from unitouch_gen.evaluation.features import embed_all
     from unitouch_gen.models.classifier import ContactClassifier
+    from unitouch_gen.models.features import text_embeddings
 
     def embed(texts: Sequence[str]) -> torch.Tensor:
         return text_embeddings(joint, processor, texts).cpu()
@@ -177,8 +178,10 @@ def figures_of(table: str, sets: Any, joint: Any, processor: Any, pipe: Any, eac
     by_images = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     rows: Rows = {}
     generated_for = set[tuple[str, int]]()
-    for sensor, in_domain, seed, splits in sets:
-        domain = "in domain" if in_domain else "out of domain"
+    for sensor, seed, splits in sets:
+        embed_all(joint, processor, splits, classifiers["touch"])
+        sensors = {name for contacts in splits.values() for name in contacts.sensors}
+        domain = "in domain" if sensors <= {*joint.config.sensors} else "out of domain"
         if table in by_label:
             accuracies = by_label[table](splits, embed)
             figures = {row: {f"{sensor}, {domain}": accuracy} for row, accuracy in accuracies.items()}

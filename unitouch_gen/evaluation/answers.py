@@ -9,11 +9,12 @@ from typing import Any
 from torch import Tensor
 from torchmetrics.functional.text import rouge_score
 
-from unitouch_gen.evaluation.contacts import Splits, float_pixels, in_batches
+from unitouch_gen.evaluation.contacts import Splits
 from unitouch_gen.evaluation.controls import Figures, others
 from unitouch_gen.evaluation.generated import sample_per_class
 from unitouch_gen.evaluation.metrics import cosines
 from unitouch_gen.evaluation.zero_shot import PROMPTS
+from unitouch_gen.models.features import float_pixels, in_batches
 from unitouch_gen.world.questions import TOPICS
 
 Asked = Mapping[str, tuple[str, Sequence[str]]]

@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.evaluation.contacts import Contacts, Splits, float_pixels, in_batches
+from unitouch_gen.evaluation.contacts import EvaluatedContacts, Splits
 from unitouch_gen.evaluation.controls import Figures, class_means, with_controls
 from unitouch_gen.evaluation.metrics import correlated, cosines, frechet_distance, retrieval, share_right
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.world import ATTRIBUTES
+from unitouch_gen.models.features import float_pixels, in_batches
 
 Classifiers = Mapping[str, ContactClassifier]  # by "image" and "touch"
 MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
@@ -74,11 +74,9 @@ def x_to_touch_table(pipe: Any, splits: Splits, classifiers: Classifiers, each: 
     return figures
 
 
-def sample_per_class(contacts: Contacts, each: int) -> Tensor:
+def sample_per_class(contacts: EvaluatedContacts, each: int) -> Tensor:
     """Rows of at most `each` contacts of every material, evenly spaced, without contacts that touch nothing."""
-    is_touching = torch.ones(len(contacts.objects), dtype=torch.bool)
-    if contacts.attributes is not None:
-        is_touching = (contacts.attributes[:, :, ATTRIBUTES.index("cover")] > 0.01).all(dim=1)
+    is_touching = contacts.is_touching
     chosen = list[Tensor]()
     for material in contacts.material.unique():
         rows = torch.nonzero((contacts.material == material) & is_touching)[:, 0]
@@ -101,7 +99,7 @@ def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) ->
 
 
 def beside_class_means(
-    encode: Callable[..., Tensor], name: str, inputs: Any, contacts: Contacts, rows: Tensor
+    encode: Callable[..., Tensor], name: str, inputs: Any, contacts: EvaluatedContacts, rows: Tensor
 ) -> dict[str, Tensor]:
     """Embeddings of some rows and, if all are labelled, the means of their classes with the norm of the row's own."""
 

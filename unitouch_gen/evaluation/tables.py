@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.evaluation import metrics
-from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits
+from unitouch_gen.evaluation.contacts import EvaluatedContacts, Splits
 from unitouch_gen.evaluation.controls import Figures, class_means, others
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 
@@ -74,7 +74,9 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
 def _classified(
     splits: Splits, label: str, prompt: Callable[[str], str], embed: Embed, *, balanced: bool = False
 ) -> Figures:
-    (train, fitted), (val, chosen), (test, known) = (_labelled(splits[split], label) for split in SPLITS)
+    train, fitted = _labelled(splits["train"], label)
+    val, chosen = _labelled(splits["val"], label)
+    test, known = _labelled(splits["test"], label)
     classes = embed([prompt(name) for name in splits["test"].classes[label]])
     predicted = {"majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
     for name in [name for name in PROBED if name in test]:
@@ -85,7 +87,7 @@ def _classified(
     return {"chance": 1 / len(known.unique()), **shares}
 
 
-def _labelled(contacts: Contacts, label: str) -> tuple[dict[str, Tensor], Tensor]:
+def _labelled(contacts: EvaluatedContacts, label: str) -> tuple[dict[str, Tensor], Tensor]:
     """Features of the contacts whose label is known, and the labels."""
     rows = contacts.labels[label] >= 0
     return {name: values[rows] for name, values in contacts.features.items()}, contacts.labels[label][rows]

@@ -7,23 +7,16 @@ from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_kind, check_texts
+from unitouch_gen.models.features import text_embeddings
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UNTOUCHED, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.world.materials import MATERIAL_NAMES
 
 PROMPTS = {**dict.fromkeys(("image", "audio", "text"), "this looks like {}"), "touch": "this feels like {}"}
 """The template of each modality; that of touch is the paper's (Table 7)."""
-
-
-@torch.no_grad()
-def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: Sequence[str]) -> Tensor:
-    """Unit embeddings of texts, (N, D)."""
-    inputs = {name: values.to(model.device) for name, values in processor.text(list(texts)).items()}
-    return F.normalize(model.get_text_features(**inputs).float(), dim=-1)
 
 
 class Named(dict[str, float]):

@@ -10,11 +10,16 @@ from PIL import Image
 from torch.nn.functional import normalize
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import SPLITS
 from unitouch_gen.evaluation.controls import statistics
+from unitouch_gen.evaluation.features import embed_all
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import heldout, open_dataset
+from unitouch_gen.training.data.contacts import SPLITS
 from unitouch_gen.training.data.heldout import of_datasets, of_world, parts_of
+from unitouch_gen.weights import TOUCH_CLASSIFIER
+
+CLASSIFIER = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
 
 
 def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cache: Path, monkeypatch):
@@ -22,10 +27,10 @@ def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cac
     monkeypatch.setattr(heldout, "CONTACTS", 1)
     for number, sensor in enumerate(model.config.sensors):
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3 + 0.2 * number))
-    found = of_world(cache, model, processor, ["digit"], [1], 1, grasps=True)
-    (name, known, seed, splits), (other, strange, *_) = found
-    assert (name, known, seed, tuple(splits)) == ("digit", True, 1001, SPLITS)
-    assert other == "sensors drawn anew" and not strange
+    (name, seed, splits), (other, _, drawn) = of_world(cache, processor, ["digit"], [1], 1, grasps=True)
+    assert (name, seed, tuple(splits)) == ("digit", 1001, SPLITS) and {*splits["test"].sensors} == {"digit"}
+    assert other == "sensors drawn anew" and {*drawn["test"].sensors} == {None}
+    embed_all(model, processor, splits, CLASSIFIER)
     objects = [set(contacts.objects.tolist()) for contacts in splits.values()]
     assert not (objects[0] & objects[1] or objects[0] & objects[2] or objects[1] & objects[2])
     assert set(splits["val"].labels["grasp"].tolist()) <= {0, 1}
@@ -60,8 +65,9 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp
     for sensor in model.config.sensors:
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3))
     data = open_dataset(folder)
-    [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
-    assert not known and [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
+    [(_, _, splits)] = of_datasets(tmp_path / "cache", processor, [data])
+    embed_all(model, processor, splits, CLASSIFIER)
+    assert [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
     test, record = splits["test"], parts_of(data)["test"].records[1]
     assert set(test.features) == {"touch", "untrained", "statistics", "supervised", "gel", "text"}
     assert test.labels["hardness"].tolist() == [record.labels["hardness"]] * 2
