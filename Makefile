@@ -10,30 +10,8 @@ ARGS ?=
 # Where `make weights` keeps what it trains, and where it puts the family together.
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
-# The stages of training in order, and what some of them take of those before.
-STAGES := image_text touch texture audio image_vae unclip touch_vae touch_ldm language_model touch_llm
-PICTURES := --joint $(RUNS)/image_text/model
-JOINT := --joint $(RUNS)/texture/model
-# Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
-STAGE_captions := image_text
-STAGE_touch_pairs := touch
-TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
-TAKES_touch_pairs := $(PICTURES) --recipe touch_pairs
-TAKES_touch := $(PICTURES) --init $(RUNS)/touch_pairs/model
-TAKES_texture := --joint $(RUNS)/touch/model
-TAKES_audio := $(JOINT)
-TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
-TAKES_touch_vae := --joint $(RUNS)/touch/model
-TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
-TAKES_language_model := $(JOINT)
-TAKES_touch_llm := $(JOINT) --llama $(RUNS)/language_model/model
-
-# Processes that keep the memory they free train and render in two thirds of the time (glibc).
-weights: export MALLOC_MMAP_THRESHOLD_ := 4000000000
-weights: export MALLOC_TRIM_THRESHOLD_ := 4000000000
 
 .DEFAULT_GOAL := help
-.NOTPARALLEL:  # stages share a cache
 .PHONY: help venv demo test test-all soak lint docs bench weights clean
 
 help:  ## list the targets
@@ -65,25 +43,9 @@ docs: $(VENV)/.installed-docs  ## build the documentation (docs/_build/html)
 bench: $(VENV)/.installed  ## measure and print every figure that the README and docs/ quote
 	$(BIN)/python -m tests.benchmarks $(ARGS)
 
-weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
+weights: $(VENV)/.installed  ## train the tiny family anew (hours), going on where it stopped
+	$(BIN)/python -m unitouch_gen.training family --runs $(RUNS)
 	$(BIN)/python samples/assemble_family.py $(RUNS) $(FAMILY)
-
-# A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
-# folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
-RECORDS := $(patsubst %,$(RUNS)/%/record.json,$(STAGES) captions touch_pairs)
-$(RECORDS): $(RUNS)/%/record.json: | $(VENV)/.installed
-	$(BIN)/python -m unitouch_gen.training $(or $(STAGE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
-		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
-
-$(foreach stage,audio unclip touch_ldm language_model,$(RUNS)/$(stage)/record.json): | $(RUNS)/texture/record.json
-$(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
-$(RUNS)/touch_pairs/record.json: | $(RUNS)/image_text/record.json
-$(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
-$(RUNS)/texture/record.json: | $(RUNS)/touch/record.json
-$(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
-$(RUNS)/touch_vae/record.json: | $(RUNS)/touch/record.json
-$(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
-$(RUNS)/touch_llm/record.json: | $(RUNS)/language_model/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
 	rm -rf build dist *.egg-info docs/_build outputs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -4,6 +4,7 @@ python samples/assemble_family.py runs my-family
 """
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -16,7 +17,8 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.saving import filling
 from unitouch_gen.schedule import TRAINED
-from unitouch_gen.training.stages import STAGES, weights_of
+from unitouch_gen.training.family import FINAL_RUNS, STAGES
+from unitouch_gen.training.stages import weights_of
 from unitouch_gen.training.touch_llm import PROMPT
 
 # Defaults of the tiny pipelines, chosen on the validation split. A touch determines a picture less than the picture's
@@ -35,16 +37,6 @@ SCHEDULERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "x-to-touch": (EulerAncestralDiscreteScheduler, {}),
 }
 
-PLACES = {
-    "audio": "joint",
-    "image_vae": "image-vae",
-    "unclip": "touch-to-image",
-    "touch_vae": "touch-vae",
-    "touch_ldm": "x-to-touch",
-    "touch_llm": "touch-to-text",
-}
-"""Folders of a family for the models of the stages."""
-
 
 def halve(folder: Path) -> None:
     """Converts all weights below a folder to fp16; integer and boolean tensors are kept."""
@@ -61,24 +53,20 @@ def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def command_of(stage: str, runs: Path) -> str:
-    """The command that runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[stage].items()]
-    return " ".join([f"python -m unitouch_gen.training {stage}", *needs, f"--output {runs / stage}"])
-
-
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:
     """The record of each stage; raises if one has not run, or was built on other weights than are there now."""
     records = {}
-    for stage, needs in STAGES.items():
-        file = runs / stage / "record.json"
-        if not file.is_file() or not (runs / stage / "model").is_dir():
-            raise InvalidInputError(f"`runs` lacks {str(file)!r}; make it with: {command_of(stage, runs)}")
-        records[stage] = json.loads(file.read_text())
-        for option, before in needs.items():
-            if records[stage]["inputs"][option] != weights_of(runs / before / "model"):
+    for run in FINAL_RUNS:
+        folder = runs / run.name
+        file = folder / "record.json"
+        if not file.is_file() or not (folder / "model").is_dir():
+            command = shlex.join(["python", "-m", "unitouch_gen.training", "family", "--runs", str(runs)])
+            raise InvalidInputError(f"`runs` lacks {str(file)!r}; make it with: {command}")
+        records[run.name] = json.loads(file.read_text())
+        for option, before in STAGES[run.name].takes.items():
+            if records[run.name]["inputs"][option] != weights_of(runs / before / "model"):
                 why = f"which was built on other weights than {before} holds now; remove it, and train it anew."
-                raise InvalidInputError(f"`runs` holds {str(runs / stage)!r}, {why}")
+                raise InvalidInputError(f"`runs` holds {str(folder)!r}, {why}")
     return records
 
 
@@ -92,8 +80,9 @@ def assemble(
     """
     records = read_records(runs)
     with filling("output", output) as folder:
-        for stage, name in PLACES.items():
-            shutil.copytree(runs / stage / "model", folder / name)
+        for run in FINAL_RUNS:
+            if run.place is not None:
+                shutil.copytree(runs / run.name / "model", folder / run.place)
         (folder / "x-to-touch" / "embedding_bank").rename(folder / "embedding-bank")
         (folder / "stylization").mkdir()
         sensors = folder / "x-to-touch" / "sensors.json"

@@ -20,7 +20,7 @@ import unitouch_gen.pipelines
 import unitouch_gen.training
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.examples import example, examples
-from unitouch_gen.training.stages import STAGES
+from unitouch_gen.training.family import STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 TRACKED = CHECKOUT / "tracked.txt"

@@ -29,34 +29,9 @@ from unitouch_gen.saving import filling
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.checkpoints import checkpoints_in, read_progress
 from unitouch_gen.training.data import Contacts, DataConfig, DrawnContacts, columns_of, computed_once
+from unitouch_gen.training.family import STAGES, folders_of
 from unitouch_gen.training.recipe import Arguments, Settings, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
-
-STAGES: dict[str, dict[str, str]] = {
-    "image_text": {},
-    "touch": {"joint": "image_text"},
-    "texture": {"joint": "touch"},
-    "audio": {"joint": "texture"},
-    "image_vae": {},
-    "unclip": {"joint": "texture", "vae": "image_vae"},
-    "touch_vae": {"joint": "touch"},
-    "touch_ldm": {"joint": "texture", "vae": "touch_vae"},
-    "language_model": {"joint": "texture"},
-    "touch_llm": {"joint": "texture", "llama": "language_model"},
-}
-"""All stages of a family in order, each with its options for an earlier stage's output, and that stage."""
-
-STARTING_FROM_WEIGHTS = ("image_text", "touch", "image_vae", "unclip", "touch_vae", "touch_ldm", "distill")
-"""Stages that may start from weights in place of random ones, by `--init`."""
-
-NEEDS = {**STAGES, "distill": {"model": "my-pipeline"}}
-"""Options for folders that a stage needs, and what is expected there; `distill` is no part of a family."""
-
-FOLDERS = ("joint", "vae", "llama", "init", "model")
-"""Options that name folders of models."""
-
-MODULES = {"touch_vae": "image_vae", "language_model": "touch_llm"}
-"""Modules of the stages that share one with another stage."""
 
 Indices = Callable[[int], Sequence[int]]  # sample indices of a batch, by the number of its step
 
@@ -287,19 +262,12 @@ def check_no_checkpoints(output: Path) -> None:
         )
 
 
-def folders_of(name: str) -> set[str]:
-    """The options of a stage that name folders of models; all but `init` are needed."""
-    options = {*NEEDS[name]}
-    if name in STARTING_FROM_WEIGHTS:
-        options.add("init")
-    return options
-
-
 def named_folders(name: str, **folders: Path | None) -> dict[str, Path]:
     """The folders of models that were named, by option; raises if a stage needs others, or does not take one."""
     named = {option: folder for option, folder in folders.items() if folder is not None}
-    if not {*NEEDS[name]} <= {*named} <= folders_of(name):
-        needed = ", ".join(f"--{option} of {stage}" for option, stage in NEEDS[name].items()) or "none"
+    takes = STAGES[name].takes
+    if not {*takes} <= {*named} <= folders_of(name):
+        needed = ", ".join(f"--{option} of {stage}" for option, stage in takes.items()) or "none"
         given = ", ".join(f"--{option}" for option in named) or "none"
         raise InvalidInputError(f"{name} needs folders of models: {needed}; it got {given}.")
     return named
@@ -319,7 +287,7 @@ def weights_of(folder: Path) -> str:
 
 def run_stage(name: str, **options: Any) -> None:
     """Runs a stage with its options. The annotation of `recipe` in its `main` is what the recipe is read as."""
-    main = import_module(f"unitouch_gen.training.{MODULES.get(name, name)}").main
+    main = import_module(f"unitouch_gen.training.{STAGES[name].module or name}").main
     stage = Stage(name, main.__annotations__["recipe"], **options)
     torch.manual_seed(stage.trainer.seed)
     main(stage, stage.recipe)

@@ -12,15 +12,16 @@ from diffusers import DDPMScheduler, UNet2DConditionModel
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.models.autoencoders import autoencoder_class
+from unitouch_gen.training.family import STAGES
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
-from unitouch_gen.training.stages import MODULES, Recipe
+from unitouch_gen.training.stages import Recipe
 
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data", "data_scanned"})
 
 
 def read_as(name: str, *overrides: str) -> Any:
     stage = re.sub("_(paper|pairs|lamps)$", "", name)
-    main = import_module(f"unitouch_gen.training.{MODULES.get(stage, stage)}").main
+    main = import_module(f"unitouch_gen.training.{STAGES[stage].module or stage}").main
     return read(main.__annotations__["recipe"], read_recipe(name, overrides))
 
 

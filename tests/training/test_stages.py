@@ -14,15 +14,16 @@ from accelerate.state import AcceleratorState
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from assemble_family import assemble, command_of
+from assemble_family import assemble
 from tests.helpers.components import AUDIO, SPACE
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.checkpoints import checkpoints_in
+from unitouch_gen.training.family import FINAL_RUNS, RUNS, STAGES
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import STAGES, Stage, weights_of
+from unitouch_gen.training.stages import Stage, weights_of
 from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import World
@@ -59,7 +60,9 @@ FROZEN = defaultdict(set, touch_llm={"language_model"})
 
 def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None:
     """Runs the command of a stage, on what the stages before have left."""
-    given = [word for option, before in STAGES[name].items() for word in (f"--{option}", str(runs / before / "model"))]
+    given = [
+        word for option, before in STAGES[name].takes.items() for word in (f"--{option}", str(runs / before / "model"))
+    ]
     overrides = [word for setting in (*SHORT, *SETTINGS[name]) for word in ("--set", setting)]
     places = ["--output", str(runs / (output or name)), "--cache", str(runs / "cache")]
     AcceleratorState._reset_state()  # as a process of its own would find it
@@ -70,17 +73,19 @@ def stage(runs: Path, name: str, *words: str, output: str | None = None) -> None
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where all stages have run."""
     runs = tmp_path_factory.mktemp("runs")
-    for name in STAGES:
-        stage(runs, name)
+    for run in FINAL_RUNS:
+        stage(runs, run.name)
     return runs
 
 
 def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path) -> None:
-    for name, needs in STAGES.items():
+    for name in [run.name for run in FINAL_RUNS]:
         assert {path.name for path in (runs / name).iterdir()} == {"checkpoints", "log.jsonl", "model", "record.json"}
         record = json.loads((runs / name / "record.json").read_text())
         assert (record["stage"], record["trainer"]["steps"], record["seed"]) == (name, 2, 0)
-        assert record["inputs"] == {option: weights_of(runs / stage / "model") for option, stage in needs.items()}
+        assert record["inputs"] == {
+            option: weights_of(runs / stage / "model") for option, stage in STAGES[name].takes.items()
+        }
         lines = [json.loads(line) for line in (runs / name / "log.jsonl").read_text().splitlines()]
         assert np.isfinite([line["loss"] for line in lines if "loss" in line]).all()
         first, last = (load_file(folder / "model.safetensors") for folder in checkpoints_in(runs / name))
@@ -163,7 +168,7 @@ def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path,
         state = load_file(runs / part / "model" / "model.safetensors")
         assert all(torch.equal(stored[key], v.half() if v.is_floating_point() else v) for key, v in state.items())
     assert {*stored} == {*state}
-    assert [*json.loads((family / "family.json").read_text())["training"]] == [*STAGES]
+    assert [*json.loads((family / "family.json").read_text())["training"]] == [run.name for run in FINAL_RUNS]
 
 
 def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_other_weights(family, runs, tmp_path):
@@ -223,30 +228,62 @@ def test_a_mistake_in_a_command_is_one_line_before_anything_is_written(joint, va
         assert message in error and list((tmp_path / "here").iterdir()) == []
 
 
-def commands(runs: Path) -> list[str]:
-    """What `make weights` would run, without the interpreter's path and the cache."""
-    words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
+def remaining(runs: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The commands that are left to train a family."""
+    run_commands(app, "unitouch_gen.training", ["family", "--runs", str(runs), "--dry-run"])
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_family_is_trained_in_an_order_in_which_every_run_finds_what_it_takes() -> None:
+    done = set[str]()
+    for run in RUNS:
+        assert {*run.takes.values()} <= done
+        done.add(run.name)
+    assert [run.name for run in FINAL_RUNS] == [name for name in STAGES if name != "distill"]
+
+
+def test_a_family_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(remaining(tmp_path, capsys)) == len(RUNS)
+    (tmp_path / "captions").mkdir()
+    (tmp_path / "captions" / "record.json").write_text("{}")
+    checkpoint = tmp_path / "image_text" / "checkpoints" / "step-00000001"
+    checkpoint.mkdir(parents=True)
+    lines = remaining(tmp_path, capsys)
+    assert len(lines) == len(RUNS) - 1 and " --recipe image_text_lamps " in lines[0]  # it has saved nothing yet
+    (checkpoint / "progress.json").write_text("{}")
+    assert remaining(tmp_path, capsys)[0] == (
+        f"python -m unitouch_gen.training image_text --init {tmp_path}/captions/model "
+        f"--output {tmp_path}/image_text --cache {tmp_path}/cache --resume"
+    )
+
+
+def test_a_family_stops_at_a_stage_that_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With the stage's exit code, after its own message."""
+    (tmp_path / "runs").write_text("a file")
+    with pytest.raises(SystemExit, match="2"):
+        run_commands(app, "unitouch_gen.training", ["family", "--runs", str(tmp_path / "runs")])
+    [error] = capfd.readouterr().err.splitlines()
+    assert str(tmp_path / "runs" / "captions") in error and "cannot be written to" in error
+
+
+needs_checkout = pytest.mark.skipif(not (CHECKOUT / "Makefile").is_file(), reason="there is no checkout")
+
+
+@needs_checkout
+def test_the_page_on_training_lists_the_commands_of_a_family(monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.chdir(tmp_path)  # where no run is done
+    lines = [line.replace(" --cache runs/cache", "") for line in remaining(Path("runs"), capsys)]
+    page = (CHECKOUT / "docs" / "training.md").read_text()
+    assert "\n".join(lines) in page
+
+
+@needs_checkout
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+def test_make_weights_trains_a_family_and_puts_it_together(tmp_path: Path) -> None:
+    words = ["make", "--dry-run", "weights", f"RUNS={tmp_path}", f"FAMILY={tmp_path / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
-    lines = done.stdout.replace("\\\n", " ").splitlines()
-    found = [" ".join(line.split()) for line in lines if "unitouch_gen.training " in line or "samples/" in line]
-    return [re.sub(r"^\S*python", "python", line.replace(f" --cache {runs / 'cache'}", "")) for line in found]
-
-
-def expected(stage: str, runs: Path) -> list[str]:
-    """Commands of a stage; pictures begin from captions alone, and touch from what it learns without pictures."""
-    whole = command_of(stage, runs)
-    if stage not in ("image_text", "touch"):
-        return [whole]
-    start, output = whole.split(" --output ")
-    before = runs / ("touch_pairs" if stage == "touch" else "captions")
-    pairs, lamps = (" --recipe touch_pairs", "") if stage == "touch" else ("", " --recipe image_text_lamps")
-    return [f"{start}{pairs} --output {before}", f"{start}{lamps} --init {before / 'model'} --output {output}"]
-
-
-@pytest.mark.skipif(
-    not (CHECKOUT / "Makefile").is_file() or shutil.which("make") is None, reason="there is no checkout or no make"
-)
-def test_make_weights_runs_stages_in_order_and_puts_them_together(tmp_path: Path) -> None:
-    family = tmp_path / "family"
-    last = f"python samples/assemble_family.py {tmp_path} {family}"
-    assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), last]
+    commands = [re.sub(r"^\S*python", "python", line) for line in done.stdout.splitlines() if str(tmp_path) in line]
+    assert commands == [
+        f"python -m unitouch_gen.training family --runs {tmp_path}",
+        f"python samples/assemble_family.py {tmp_path} {tmp_path / 'family'}",
+    ]
