@@ -1,12 +1,13 @@
 """Base class of the pipelines: the checks of a call, encoding, the denoising loops, decoding, reading and saving."""
 
 import copy
+import json
 import math
 import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -40,13 +41,13 @@ from unitouch_gen.errors import (
     check_unused,
     describe,
 )
-from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, reading
+from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, read_settings, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, normalise_pixels
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.videos import is_untouched
-from unitouch_gen.pipelines.hub import CARD, Card, name_classes, resolve_classes
+from unitouch_gen.pipelines.hub import CARD, RECORD, Card, name_classes, resolve_classes
 from unitouch_gen.sampling import (
     Denoiser,
     Guidance,
@@ -136,6 +137,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
     embedding_bank: Any = None  # touch-to-text has none
     _card = Card()
+    _record: Mapping[str, Any] = {}  # of the network's training; `distill` reads it in a saved folder
 
     def _finish_init(self, network: str, **defaults: Any) -> None:
         """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
@@ -541,6 +543,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             for part, network in pipe.components.items():
                 if part not in kwargs and part != "unitouch" and isinstance(network, torch.nn.Module):
                     check_filled(folder / part, network)
+            if (folder / RECORD).is_file():
+                pipe._record = read_settings(name, folder / RECORD)
         pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
         return pipe
 
@@ -563,7 +567,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Writes the pipeline into a folder, as `DiffusionPipeline.save_pretrained` does; other files there stay.
 
         Also writes two-line Python files, by which `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
-        finds our classes, and a model card, README.md. Without `card`, an existing card stays.
+        finds our classes, and a model card, README.md. Without `card`, an existing card stays. The
+        record of the network's training, if there is one, is written as record.json.
 
         Raises:
             InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
@@ -585,6 +590,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 name_classes(place)
             if card is not None or not (folder / CARD).exists():
                 (card or self._card).write(place, name, self)
+            if self._record:
+                (place / RECORD).write_text(json.dumps(self._record, indent=2) + "\n", encoding="utf-8")
         if upload:
             self.push_to_hub(name, card=card, **kwargs)
 

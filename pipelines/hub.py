@@ -36,6 +36,7 @@ from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
 CARD = "README.md"
+RECORD = "record.json"
 PICTURES = "pictures"
 TEMPLATE = Path(__file__).with_name("card.md")
 

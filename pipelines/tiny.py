@@ -31,6 +31,14 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "x-to-touch": XToTouchPipeline,
     "touch-to-text": TouchToTextPipeline,
 }
+TRAINED_BY = {
+    "touch-to-image": "unclip",
+    "stylization": "unclip",
+    "x-to-touch": "touch_ldm",
+    "touch-to-text": "touch_llm",
+}
+"""The stages of training of their networks."""
+
 TURBO = {"touch-to-image-turbo": "touch-to-image", "x-to-touch-turbo": "x-to-touch"}
 """Distilled pipelines, and those that they were distilled from, whose folders hold the LoRA weights in `turbo`."""
 
@@ -91,7 +99,10 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         pipe = kind(**parts)
         if name in TURBO:
             pipe = distilled(pipe, folder / "turbo")
-        pipe._card = _card(family, name)
+        content = _family_content(family)
+        pipe._card = _card(family, content, name)
+        record = content.get("training", {}).get(TRAINED_BY.get(name), {})
+        pipe._record = {key: value for key, value in record.items() if key != "started_from"}
     return pipe
 
 
@@ -132,11 +143,15 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-def _card(family: Path, name: str) -> Card:
-    """The model card that the family's `family.json` describes, or a plain one."""
+def _family_content(family: Path) -> dict[str, Any]:
+    """The family's `family.json`; empty if it has none."""
     file = family / weights.FIGURES.name
-    cards = read_settings("family", file).get("cards", {}) if file.is_file() else {}
-    settings = dict(cards.get(name, {}))
+    return read_settings("family", file) if file.is_file() else {}
+
+
+def _card(family: Path, content: dict[str, Any], name: str) -> Card:
+    """The model card that the `content` of the family's `family.json` describes, or a plain one."""
+    settings = dict(content.get("cards", {}).get(name, {}))
     pictures = {
         caption: family / weights.CARDS.name / stored for caption, stored in settings.pop("pictures", {}).items()
     }

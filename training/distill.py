@@ -176,6 +176,20 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, in
     train_layers(unet)
 
 
+def teacher_objective(folder: Path, name: str) -> dict[str, Any]:
+    """The section `objective` of the recipe that a saved pipeline's network was trained by.
+
+    It is read from the pipeline's `record.json`. A pipeline without one, such as a published one, is taken to be
+    trained by the package's own recipe of stage `name`.
+    """
+    file = folder / "record.json"
+    if not file.is_file():
+        return read_recipe(name)["objective"]
+    record = read_settings("model", file)
+    check_choice("model: record.json: stage", record.get("stage"), [name])
+    return dict(record["recipe"]["objective"])
+
+
 def conditioned_touches(
     stage: Stage, settings: Arguments, unet: Any, scheduler: Any, joint: UniTouchModel, vae: Autoencoder
 ) -> tuple[Conditioned, ArrayDataset]:
@@ -188,9 +202,13 @@ def conditioned_touches(
         if sensors and (source.sensor is not None or not with_gels):
             check_choice("data: sensor", source.sensor, sensors)
     dataset, gels = touch_ldm.inputs(stage, joint, vae, sensors, with_gels)
-    objective_settings = read(touch_ldm.TouchDiffusionSettings, read_recipe("touch_ldm")["objective"])
+    section = teacher_objective(stage.folders["model"], "touch_ldm")
     objective = touch_ldm.TouchDiffusionObjective(
-        unet, scheduler, joint.config.embedding_norm, settings=objective_settings, backgrounds=gels
+        unet,
+        scheduler,
+        joint.config.embedding_norm,
+        settings=read(touch_ldm.TouchDiffusionSettings, section),
+        backgrounds=gels,
     )
     return objective, dataset
 
@@ -207,7 +225,7 @@ def conditioned_pictures(
         text_encoder = read_network(CLIPTextModel, folder / "text_encoder")
         processor.tokenizer = read_tokenizer("model", folder / "tokenizer")
     dataset, captions = unclip.inputs(stage, joint, vae)
-    section = read_recipe("unclip")["objective"] | {"gain": min(settings["default_strength"], 1.0)}
+    section = teacher_objective(folder, "unclip") | {"gain": min(settings["default_strength"], 1.0)}
     objective = unclip.UnclipObjective(
         unet,
         scheduler,

@@ -20,10 +20,11 @@ from tests.helpers.data_sets import write_image
 from tests.helpers.small_family import write_small_family
 from unitouch_gen import tiny
 from unitouch_gen.cli import commands
-from unitouch_gen.errors import run_commands
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.checkpoints import checkpoints_in
-from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers
+from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers, teacher_objective
+from unitouch_gen.training.recipe import read_recipe
 
 pytest.importorskip("peft", reason="LoRA needs peft")
 SETTINGS = DistillSettings(timesteps=[999, 619, 299, 79], margin=0.02, critic_rank=2)
@@ -185,6 +186,23 @@ def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
             for one, call in ((known, embeds), (pipe, ours))
         ]
         assert_close(*pictures, atol=1e-5, rtol=1e-4)
+
+
+def test_conditions_are_drawn_as_in_the_teachers_own_training(tmp_path: Path) -> None:
+    """By the record of its family, which is saved with a pipeline also after it was read again."""
+    family = tmp_path / "family"
+    write_small_family(family)
+    objective = {**read_recipe("touch_ldm")["objective"], "condition_noise": 0.9}
+    record = {"stage": "touch_ldm", "recipe": {"objective": objective}}
+    (family / "family.json").write_text(json.dumps({"training": {"touch_ldm": record}}))
+    pipe = quiet(tiny("x-to-touch", family=family))
+    pipe.save_pretrained(tmp_path / "saved")
+    quiet(type(pipe).from_pretrained(tmp_path / "saved")).save_pretrained(tmp_path / "again")
+    assert teacher_objective(tmp_path / "again", "touch_ldm") == objective
+    with pytest.raises(InvalidInputError, match=r"`model: record\.json: stage` is 'touch_ldm'"):
+        teacher_objective(tmp_path / "again", "unclip")
+    (tmp_path / "again" / "record.json").unlink()
+    assert teacher_objective(tmp_path / "again", "touch_ldm") == read_recipe("touch_ldm")["objective"]
 
 
 def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line(
