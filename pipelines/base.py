@@ -175,7 +175,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _check_arguments(self, **given: Any) -> SamplingArguments:
         """The arguments of a call, checked, with the checkpoint's steps and bank where they are `None`."""
         self._check_device()
-        arguments = check_fields(SamplingArguments, **given)
+        arguments = check_fields(SamplingArguments, given)
         config = self.config
         changes: dict[str, Any] = {}
         if arguments.tolerance is None and arguments.timesteps is None:

@@ -13,7 +13,8 @@ from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipel
 
 def test_numbers_of_other_libraries_become_pythons():
     arguments = check_fields(
-        SamplingArguments, num_inference_steps=np.int64(3), timesteps=(9, np.int32(2)), eta=1, tolerance=Fraction(1, 2)
+        SamplingArguments,
+        {"num_inference_steps": np.int64(3), "timesteps": (9, np.int32(2)), "eta": 1, "tolerance": Fraction(1, 2)},
     )
     numbers = (arguments.num_inference_steps, *arguments.timesteps, arguments.eta, arguments.tolerance)
     assert numbers == (3, 9, 2, 1.0, 0.5)
@@ -25,6 +26,7 @@ def test_numbers_of_other_libraries_become_pythons():
     [
         ({"eta": 2}, InvalidInputError, "`eta` is 2; it has to be at most 1."),
         ({"height": 0}, InvalidInputError, "`height` is 0; it has to be at least 1."),
+        ({"timesteps": [9, 2.5]}, InvalidTypeError, "`timesteps.1` is 2.5; it has to be a valid integer."),
         ({"width": 2.5}, InvalidTypeError, "`width` is 2.5; it has to be a valid integer."),
         (
             {"mix": "papre"},
@@ -35,7 +37,7 @@ def test_numbers_of_other_libraries_become_pythons():
 )
 def test_a_message_says_what_came_and_what_is_wanted(values, error, message):
     with pytest.raises(error) as caught:
-        check_fields(SamplingArguments, **values)
+        check_fields(SamplingArguments, values)
     assert str(caught.value) == message
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from unitouch_gen.errors import InvalidInputError, describe, did_you_mean, first_line
+from unitouch_gen.errors import InvalidInputError, check_fields, describe, did_you_mean, first_line
 from unitouch_gen.files import as_path, read_settings
 
 RECIPES = Path(__file__).parent / "recipes"
@@ -85,20 +85,9 @@ def read(kind: type[SettingsKind], values: Any) -> SettingsKind:
     """A recipe, or one section of it, as settings of a `kind`.
 
     Raises:
-        InvalidInputError: Naming the first key that is wrong.
+        InvalidInputError, InvalidTypeError: Naming the first key that is wrong.
     """
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"])) or "recipe"
-        if "error" in first.get("ctx", {}):  # raised by a validator of the package
-            message = f"In `{key}`, {first['ctx']['error']}"
-        elif first["type"] == "missing":
-            message = f"`{key}` is missing in the recipe; set it."
-        else:
-            message = f"`{key}` is {describe(first['input'])}; {first['msg'].replace('Input should', 'it has to')}."
-        raise InvalidInputError(message) from error
+    return check_fields(kind, values, "recipe")
 
 
 def build(section: str, kind: Callable[..., Built], arguments: Arguments, **fixed: Any) -> Built:

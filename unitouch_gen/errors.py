@@ -171,19 +171,28 @@ def plain_integer(value: Any) -> Any:
     return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
 
 
-def check_fields(model: "type[Model]", **values: Any) -> "Model":
-    """Values as a pydantic model; raises on the first that is of a wrong kind or out of bounds."""
+def check_fields(model: "type[Model]", values: Any, whole: str = "arguments") -> "Model":
+    """Values as a pydantic model; raises on the first that is missing, of a wrong kind, or out of bounds.
+
+    `whole` is what the values are together, in messages.
+    """
     from pydantic import ValidationError
 
     try:
-        return model(**values)
+        return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        name = str(first["loc"][0])
+        name = ".".join(map(str, first["loc"])) or whole
+        context = first.get("ctx", {})
+        if "error" in context:  # raised by a validator of the package
+            raise InvalidInputError(f"In `{name}`, {context['error']}") from error
+        if first["type"] == "missing":
+            raise InvalidInputError(f"`{name}` is missing in the {whole}; set it.") from error
         wanted = first["msg"].replace("Input should", "it has to")
         wanted = wanted.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
-        choices = re.findall(r"'([^']*)'", str(first.get("ctx", {}).get("expected", "")))
-        message = f"`{name}` is {describe(values[name])}; {wanted}. {did_you_mean(values[name], choices)}".strip()
+        choices = re.findall(r"'([^']*)'", str(context.get("expected", "")))
+        value = first["input"]
+        message = f"`{name}` is {describe(value)}; {wanted}. {did_you_mean(value, choices)}".strip()
         wrong_kind = first["type"].endswith("_type")
         raise (InvalidTypeError if wrong_kind else InvalidInputError)(message) from error
 

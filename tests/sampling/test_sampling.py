@@ -32,7 +32,7 @@ def run(network=None, problem=PLAIN, **options):
 
 
 def steps_of(scheduler=OWN, **arguments):
-    return prepare_steps(scheduler, check_fields(SamplingArguments, **arguments))[0]
+    return prepare_steps(scheduler, check_fields(SamplingArguments, arguments))[0]
 
 
 # What a call may say of its steps -------------------------------------------------------------------------------------

@@ -143,7 +143,7 @@ class Problem:
         **arguments: Any,
     ) -> tuple[Tensor, RunReport]:
         """Latents and report of one run from unit-variance noise; `arguments` are `SamplingArguments`."""
-        given = check_fields(SamplingArguments, solver=solver, **arguments)
+        given = check_fields(SamplingArguments, {"solver": solver, **arguments})
         steps, _ = prepare_steps(scheduler or self.scheduler(), given)
         denoise = self.denoiser(network or self.network(len(noise)))
         status = SampleStatus(len(noise), noise.device)
