@@ -58,9 +58,11 @@ def test_figures_of_the_readme_are_quoted_from_the_pages():
     assert not [figure for figure in figures if figure not in measured]
 
 
-@pytest.mark.wheel
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, id=page.stem, marks=pytest.mark.wheel if page == README else ()) for page in PAGES],
+)
 def test_snippets_run(page, tmp_path):
     """Those in Python, one after the other, but for those that need weights which are not here."""
     blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)

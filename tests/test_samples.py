@@ -53,7 +53,6 @@ def test_no_sample_replaces_a_tracked_picture_unasked():
         assert all(path.startswith("outputs/") for path in places) and (places or file.stem in NOT_RUN), file.name
 
 
-@pytest.mark.wheel
 @pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
 def test_samples_run(file, tmp_path):
@@ -74,7 +73,6 @@ def test_model_cards_show_what_the_built_in_weights_draw(name, tmp_path):
     assert np.abs(drawn - shown).mean() < 1
 
 
-@pytest.mark.wheel
 @pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.ipynb")), ids=lambda file: file.stem)
 def test_notebooks_run_from_top_to_bottom(file, tmp_path):

@@ -56,6 +56,7 @@ def test_costs_are_the_fewest_evaluations_within_an_error(pipe):
     assert {error: row["steps"] for error, row in costs.items()} == {"2": 4}
 
 
+@pytest.mark.slow
 def test_finer_touches_are_nearer_to_the_finest() -> None:
     for settings in physics_figures(2, 1).values():
         errors = [figures["error"] for figures in settings.values()]
@@ -75,7 +76,7 @@ class Elements(TorchDispatchMode):
 
 
 def test_each_request_does_less_than_everything() -> None:
-    index, counts = torch.arange(8), {}
+    index, counts = torch.arange(2), {}
     for names in (MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
         with Elements() as elements:
             World().render(index, 0 * index, 0 * index, modalities=names, sensors=tuple(SENSORS))

@@ -313,6 +313,7 @@ def test_addresses_in_place_of_files_are_not_fetched(address, connected, capfd, 
     assert {host for host, *_ in connected} == {"127.0.0.1"}
 
 
+@pytest.mark.slow
 def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_up(here, models, tmp_path, files):
     try:
         host, port = "::1", free_port("::1")

@@ -69,7 +69,7 @@ def test_a_broken_pixel_spoils_no_other_touch() -> None:
 def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
     """The world's own depths, less what is wide in them."""
     world, count, found = World(seed=3), len(MATERIAL_NAMES), []
-    for number in range(8):
+    for number in range(4):
         names, wanted = (list(range(count)), [number] * count, [0] * count), ("touch", "depth")
         scene = world.render(*names, modalities=wanted, sensors=[draw_sensor(3, number)])
         (touch,), (depth,) = scene.touch.values(), scene.depth.values()
@@ -78,6 +78,6 @@ def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
         read = relief(normalise_pixels(touch))[:, 2]
         found += [alike(a, b) for a, b in zip(read[there], detail[there], strict=True)]
     signed = torch.tensor(found)
-    assert len(signed) > 80
+    assert len(signed) > 40
     assert signed.abs().median() > 0.75
     assert (signed[signed.abs() > 0.5] > 0).float().mean() > 0.8  # joints, pores and holes read as rises

@@ -49,7 +49,7 @@ def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> fl
     levels, _ = prepare_steps(problem.scheduler(), arguments)
     sigmas = torch.tensor(levels[:-1], dtype=torch.float64)
     higher = SOLVERS[solver].order > 1
-    values = torch.stack(along(problem, sigmas.tolist()))  # D, (n, 4, d)
+    values = along(problem, tuple(sigmas.tolist()))
     steps = -sigmas.log().diff()[:, None, None]
     slopes = values.diff(dim=0) / steps
     local = steps**2 / 2 * slopes.abs()
@@ -58,13 +58,14 @@ def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> fl
         curvatures = 2 * slopes.diff(dim=0) / (before + after)
         local[1:] = (after**3 / 6 + after**2 * before / 4) * (curvatures.abs() + 2 * slopes[1:].abs())
     at_the_end = (carried(problem, sigmas[1:, None])[:, None] * local).sum(dim=0)
-    return worst(at_the_end + last_step(problem, sigmas.tolist(), higher), problem) + num_inference_steps * ROUNDING
+    return worst(at_the_end + last_step(problem, sigmas, values, higher), problem) + num_inference_steps * ROUNDING
 
 
-def along(problem: Problem, sigmas: list[float]) -> list[Tensor]:
-    """D on the exact path at each noise level, (4, d)."""
-    path = problem.path(problem.noise(4), sigmas)
-    return [problem.denoise(x, sigma).flatten(1) for x, sigma in zip(path, sigmas, strict=True)]
+@cache
+def along(problem: Problem, sigmas: tuple[float, ...]) -> Tensor:
+    """D on the exact path at each noise level, (n, 4, d)."""
+    path = problem.path(problem.noise(4), list(sigmas))
+    return torch.stack([problem.denoise(x, sigma).flatten(1) for x, sigma in zip(path, sigmas, strict=True)])
 
 
 def carried(problem: Problem, sigma: Tensor | float) -> Tensor:
@@ -75,13 +76,14 @@ def carried(problem: Problem, sigma: Tensor | float) -> Tensor:
     return other ** ((1 - scale) / 2) * conditional ** (scale / 2)
 
 
-def last_step(problem: Problem, sigmas: list[float], higher: bool) -> Tensor:
-    """Error of the step to sigma = 0, (4, d): order 1 ends with D at the smallest level, higher ones with the line in
-    sigma^2 through it and the last level that is 1.5 times as large."""
-    wider = [sigma for sigma in sigmas if sigma >= MIN_LEVEL_RATIO * sigmas[-1]][-1:] if higher else []
-    *earlier, end = along(problem, [*wider, sigmas[-1]])
-    for sigma, value in zip(wider, earlier, strict=True):
-        end = end + (end - value) * sigmas[-1] ** 2 / (sigma**2 - sigmas[-1] ** 2)
+def last_step(problem: Problem, sigmas: Tensor, values: Tensor, higher: bool) -> Tensor:
+    """Error of the step to sigma = 0, (4, d), given D at all levels: order 1 ends with D at the smallest level, higher
+    ones with the line in sigma^2 through it and the last level that is 1.5 times as large."""
+    end = values[-1]
+    wider = (sigmas >= MIN_LEVEL_RATIO * sigmas[-1]).nonzero().flatten()
+    if higher and len(wider) > 0:
+        other = wider[-1]
+        end = end + (end - values[other]) * sigmas[-1] ** 2 / (sigmas[other] ** 2 - sigmas[-1] ** 2)
     return (end - truth(problem).flatten(1)).abs()
 
 

@@ -140,12 +140,12 @@ def run(words: list[str]) -> None:
     run_commands(app, "unitouch_gen.training", ["distill", *words])
 
 
-@pytest.mark.parametrize("name", PIPELINES)
-def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
-    name: str, cache: Path, tmp_path: Path
-) -> None:
-    pipe = quiet(make_pipelines()[name])
-    pipe.save_pretrained(tmp_path / "teacher")
+STORED = "model/pytorch_lora_weights.safetensors"
+
+
+@pytest.mark.slow
+def test_a_distillation_is_resumed_to_the_same_bits_and_begun_from_its_own_weights(cache: Path, tmp_path: Path) -> None:
+    make_pipelines()["touch-to-image"].save_pretrained(tmp_path / "teacher")
     run(words_of(tmp_path / "teacher", tmp_path / "run", cache))
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (checkpoints_in(tmp_path / "again")[-1] / "progress.json").unlink()
@@ -153,16 +153,26 @@ def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
     assert not run_commands(commands, "unitouch-gen", ["distill", *words])
     further = ["--init", str(tmp_path / "run" / "model"), "--set", "trainer.learning_rate=1e-9"]
     run(words_of(tmp_path / "teacher", tmp_path / "further", cache, *further))
+    layers, again, still = (load_file(tmp_path / run / STORED) for run in ("run", "again", "further"))
+    assert layers.keys() == again.keys()
+    assert all(torch.equal(again[key], value) for key, value in layers.items())
+    assert_close(still, layers, atol=1e-6, rtol=1e-3)
+    assert json.loads((tmp_path / "further" / "record.json").read_text())["started_from"]["stage"] == "distill"
     wide = words_of(tmp_path / "teacher", tmp_path / "wide", cache, *further, "--set", "lora.r=3")
     with pytest.raises(SystemExit, match="2"):
         run(wide)
-    stored = "model/pytorch_lora_weights.safetensors"
-    layers, again, still = (load_file(tmp_path / run / stored) for run in ("run", "again", "further"))
-    assert_close(still, layers, atol=1e-6, rtol=1e-3)
-    assert layers.keys() == again.keys() and all(torch.equal(again[key], value) for key, value in layers.items())
+
+
+@pytest.mark.parametrize("name", PIPELINES)
+def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
+    name: str, cache: Path, tmp_path: Path
+) -> None:
+    pipe = quiet(make_pipelines()[name])
+    pipe.save_pretrained(tmp_path / "teacher")
+    run(words_of(tmp_path / "teacher", tmp_path / "run", cache))
+    layers = load_file(tmp_path / "run" / STORED)
     assert {value.dtype for value in layers.values()} == {torch.float16}
     assert any(bool(value.abs().max() > 0) for key, value in layers.items() if "lora_B" in key or ".up." in key)
-    assert json.loads((tmp_path / "further" / "record.json").read_text())["started_from"]["stage"] == "distill"
 
     pipe.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
     shape = (1, pipe.unet.config.out_channels, 8, 8)
