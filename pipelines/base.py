@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from inspect import signature
 from pathlib import Path
+from types import NoneType
 from typing import Any, Self
 
 import torch
@@ -29,17 +30,18 @@ from unitouch_gen.arguments import MAX_SCALE, SamplingArguments
 from unitouch_gen.conditioning import match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
-    InvalidTypeError,
     NonFiniteError,
     check_arguments,
     check_choice,
+    check_count,
     check_dtype,
+    check_equal,
     check_fields,
+    check_integer,
     check_kind,
     check_number,
     check_tensor,
     check_unused,
-    describe,
 )
 from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, read_settings, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
@@ -154,27 +156,26 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
         }
         for name, width in widths.items():
-            if width not in (None, self.embedding_dim):
-                raise InvalidInputError(f"`{name}` has width {width}, but {network} takes {self.embedding_dim}.")
+            if width is not None:
+                check_equal(name, "width", width, self.embedding_dim, f"as {network} takes")
+
+    def _require(self, argument: str, *parts: str, instead: str = "pass embeddings") -> None:
+        """Raises if a component that an argument needs is missing; `instead` is what a user can do without it."""
+        missing = " and ".join(f"`{part}`" for part in parts if getattr(self, part) is None)
+        if missing:
+            raise InvalidInputError(
+                f"`{argument}` needs {missing}, which this pipeline lacks; build it with that, or {instead}."
+            )
 
     def _joint(self, argument: str) -> Any:
-        """The joint space; if there is none, raises an error that names the argument which needs it."""
-        if self.unitouch is None or self.processor is None:
-            raise InvalidInputError(
-                f"`{argument}` needs the joint space, but this pipeline lacks `unitouch` or `processor`; build it with "
-                "both, or pass embeddings."
-            )
+        """The joint space, for an argument which needs it."""
+        self._require(argument, "unitouch", "processor")
         return self.unitouch
 
     # Checks of a call, before any network runs ------------------------------------------------------------------------
 
-    def _check_device(self) -> None:
-        if self._execution_device.type == "meta":
-            raise InvalidInputError("The pipeline is on the device 'meta', which keeps no numbers; read it again.")
-
     def _check_arguments(self, **given: Any) -> SamplingArguments:
         """The arguments of a call, checked, with the checkpoint's steps and bank where they are `None`."""
-        self._check_device()
         arguments = check_fields(SamplingArguments, given)
         config = self.config
         changes: dict[str, Any] = {}
@@ -189,8 +190,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 changes["num_inference_steps"] = config.default_num_inference_steps
         if arguments.bridge is None:
             changes["bridge"] = self.embedding_bank is not None
-        elif arguments.bridge and self.embedding_bank is None:
-            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
+        elif arguments.bridge:
+            self._require("bridge", "embedding_bank", instead="pass False")
         return arguments.model_copy(update=changes)
 
     def _latents_shape(self, inputs: int, arguments: SamplingArguments) -> tuple[int, int, int, int]:
@@ -202,9 +203,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         for name, side in zip(("height", "width"), trained, strict=True):
             pixels = getattr(arguments, name)
             if pixels is None:
-                if not side:
-                    raise InvalidTypeError(f"`{name}` is None, and the UNet has no size of its own; pass an integer.")
-                pixels = side * self.vae_scale_factor
+                # A UNet may have no size of its own.
+                pixels = check_integer(name, side, 1) * self.vae_scale_factor
             if pixels % self.vae_scale_factor:
                 raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {self.vae_scale_factor}.")
             sides.append(pixels // self.vae_scale_factor)
@@ -224,16 +224,15 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Raises on arguments of a call that do not fit its latents, of a shape (B n, C, h, w), or each other."""
         if latents is not None:
             check_tensor("latents", latents, *shape)
-        if isinstance(generator, list) and len(generator) != shape[0]:
-            raise InvalidInputError(f"`generator` has {len(generator)} for {shape[0]} images; pass one, or one each.")
-        for one in generator if isinstance(generator, list) else [generator] * (generator is not None):
-            check_kind("generator", one, torch.Generator)
-        lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, type(None)) or {}
+        generators = generator if isinstance(generator, list) else [generator]
+        check_count("generator", len(generators), shape[0])
+        for one in generators:
+            check_kind("generator", one, torch.Generator, NoneType)
+        lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, NoneType) or {}
         check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
-        if callback_on_step_end is not None and not callable(callback_on_step_end):
-            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback_on_step_end)}; pass a function.")
+        check_kind("callback_on_step_end", callback_on_step_end, Callable, NoneType)
         if isinstance(callback_on_step_end, DIFFUSERS_CALLBACKS):
-            check_unused("callback_on_step_end", tolerance=arguments.tolerance)  # it counts steps
+            check_unused("with a `callback_on_step_end` that counts steps", tolerance=arguments.tolerance)
         for name in check_kind("callback_on_step_end_tensor_inputs", callback_on_step_end_tensor_inputs, list, tuple):
             check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
 
@@ -250,7 +249,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         backgrounds = backgrounds.expand_as(pixels)
         matches = sensor_bank.match(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
-            raise InvalidInputError("`background` was passed, but this model has no sensor prototypes; leave it out.")
+            check_unused("on a model without sensor prototypes", background=background)
         return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
@@ -527,8 +526,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """
         components, defaults = cls._get_signature_keys(cls)
         check_arguments("`from_pretrained`", kwargs, {*LOADING_OPTIONS, *components, *defaults})
-        if kwargs.get("use_safetensors") is False:
-            raise InvalidInputError("`use_safetensors` is False, but only safetensors are read; leave it out.")
+        check_safetensors("use_safetensors", kwargs.get("use_safetensors"))
         name = "pretrained_model_name_or_path"
         kwargs = {**kwargs, "use_safetensors": True}
         key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
@@ -573,9 +571,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         Raises:
             InvalidInputError: If LoRA weights are loaded, or the folder cannot be written to; what it held stays.
         """
-        check_kind("card", card, Card, type(None))
-        if not safe_serialization:
-            raise InvalidInputError("`safe_serialization` is False, but only safetensors are written; leave it out.")
+        check_kind("card", card, Card, NoneType)
+        check_safetensors("safe_serialization", safe_serialization)
         check_arguments("`save_pretrained`", kwargs, SAVING_OPTIONS)
         folder = as_path("save_directory", save_directory)
         upload = kwargs.pop("push_to_hub", False)
@@ -634,10 +631,10 @@ def check_components(kind: type[DiffusionPipeline], folder: Path, passed: Contai
             check_saved(folder / name, kinds.get(name, "network"))
 
 
-def check_count(name: str, count: int, inputs: int) -> None:
-    """Raises unless there is one for all of the inputs, or one for each."""
-    if count not in (1, inputs):
-        raise InvalidInputError(f"`{name}` holds {count} for {inputs} inputs; pass one, or one each.")
+def check_safetensors(name: str, value: Any) -> None:
+    """Raises if a user asks for pickles."""
+    if value is False:
+        raise InvalidInputError(f"`{name}` is False, but only safetensors are read and written; leave it out.")
 
 
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:

@@ -10,14 +10,13 @@ from torch import Tensor
 
 from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.conditioning import mix_linear, mix_to_norm
-from unitouch_gen.errors import InvalidInputError, check_number
+from unitouch_gen.errors import InvalidInputError, check_count, check_number
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.pipelines.base import (
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
-    check_count,
     check_weights,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput

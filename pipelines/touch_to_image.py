@@ -23,10 +23,13 @@ from unitouch_gen.arguments import MAX_SCALE, SamplingArguments
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
+    check_count,
     check_dtype,
+    check_equal,
     check_integer,
     check_kind,
     check_number,
+    check_passed,
     check_tensor,
     check_texts,
     check_unused,
@@ -40,7 +43,6 @@ from unitouch_gen.pipelines.base import (
     StepEndCallback,
     Touches,
     UniTouchPipeline,
-    check_count,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import read_joint, read_unclip
@@ -104,8 +106,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         )
         width = self.embedding_dim
         labels = unet.config.projection_class_embeddings_input_dim
-        if labels != 2 * width:
-            raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
+        check_equal("unet", "class labels of width", labels, 2 * width, "twice that of the embeddings")
         self._finish_init(
             "the unCLIP model",
             default_strength=default_strength,
@@ -210,8 +211,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             UnfamiliarInputWarning: On touches out of distribution, and on untouched gels.
         """
         # 1. Check inputs, before any network runs
-        if (touch is None) == (touch_embeds is None):
-            raise InvalidInputError("Either `touch` or `touch_embeds` has to be passed.")
+        check_passed({"touch": touch, "touch_embeds": touch_embeds}, only_one=True)
         arguments = self._check_arguments(
             height=height,
             width=width,
@@ -231,7 +231,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         )
         if touch_embeds is not None:
             check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
-            check_unused("touch_embeds", strength=strength, sensor=sensor, background=background, bridge=bridge or None)
+            others = {"strength": strength, "sensor": sensor, "background": background, "bridge": bridge or None}
+            check_unused("with `touch_embeds`", **others)
         touches = None if touch is None else self._read_touches(touch, sensor, background)
         batch_size = len(touch_embeds if touches is None else touches.pixels)  # type: ignore[arg-type]
         shape = self._latents_shape(batch_size, arguments)
@@ -327,12 +328,11 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> list[str] | Tensor:
         """The prompts of a branch, `default` if there is none; or the hidden states in their place."""
         if embeds is not None:
-            check_unused(f"{name}_embeds", **{name: prompt})
+            check_unused(f"with `{name}_embeds`", **{name: prompt})
             check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
             check_count(f"{name}_embeds", len(embeds), batch_size)
             return embeds
-        if self.text_encoder is None or self.tokenizer is None:
-            raise InvalidInputError(f"`{name}` needs a text encoder, and there is none; pass `{name}_embeds`.")
+        self._require(name, "text_encoder", "tokenizer")
         texts = check_texts(name, default if prompt is None else prompt)
         check_count(name, len(texts), batch_size)
         return texts * batch_size if len(texts) == 1 else texts
@@ -368,8 +368,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Equal prompts are encoded once. `lora_scale` multiplies the text encoder's LoRA weights.
         """
-        if self.text_encoder is None or self.tokenizer is None:
-            raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
+        self._require("prompt", "text_encoder", "tokenizer")
         check_number("lora_scale", lora_scale, -MAX_SCALE, MAX_SCALE)
         return self._encode_prompt(check_texts("prompt", prompt), lora_scale)
 
@@ -450,9 +449,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Its `image_embeds` may be touch embeddings. `from_pipe(..., unitouch=..., embedding_bank=...)` is the inverse.
         """
-        for name in ("unitouch", "tokenizer", "text_encoder"):
-            if getattr(self, name) is None:
-                raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
+        self._require("to_diffusers", "unitouch", "tokenizer", "text_encoder", instead="call this one")
         ours = ("unitouch", "processor", "embedding_bank")
         shared = {name: part for name, part in self.components.items() if name not in ours}
         encoder = self.unitouch.load("image")[0]

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import takewhile
+from types import NoneType
 from typing import Any
 
 import torch
@@ -14,13 +15,15 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from unitouch_gen.errors import (
     InvalidInputError,
+    check_count,
     check_integer,
     check_kind,
+    check_passed,
     check_tensor,
     check_texts,
     check_unused,
     did_you_mean,
-    first_line,
+    explain_errors,
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
@@ -112,10 +115,8 @@ class TouchToTextPipeline(UniTouchPipeline):
             >>> pipe("touch.png", "How does it feel?").texts  # doctest: +SKIP
         """
         # 1. Check inputs, before any network runs
-        self._check_device()
         name, inputs, batch_size = self._read_inputs(touch, image, touch_embeds, sensor=sensor, background=background)
-        if generator is not None:
-            check_kind("generator", generator, torch.Generator)
+        check_kind("generator", generator, torch.Generator, NoneType)
         prompts = self._tokenize(question, batch_size)
         config, options = self._check_options(prompts, max_new_tokens, generate)
         report = AnswerReport(prompt_tokens=[len(prompt) for prompt in prompts])
@@ -152,7 +153,6 @@ class TouchToTextPipeline(UniTouchPipeline):
     @torch.no_grad()
     def encode_touch(self, touch: ImageInput, sensor: SensorNames = None, background: ImageInput = None) -> Tensor:
         """Embeddings (B, D) that the language bridge takes; for arguments and errors see `__call__`."""
-        self._check_device()
         touches = self._read_touches(touch, sensor, background)
         with threads_for(self._num_weights * len(touches.pixels)):
             return self._encode("touch", touches, AnswerReport())
@@ -176,14 +176,11 @@ class TouchToTextPipeline(UniTouchPipeline):
     ) -> tuple[str, Any, int]:
         """Which of the inputs was passed; its touches, pixel values or embeddings; and their number."""
         passed = {"touch": touch, "image": image, "touch_embeds": touch_embeds}
-        names = [name for name, value in passed.items() if value is not None]
-        if len(names) != 1:
-            raise InvalidInputError("One of `touch`, `image` and `touch_embeds` has to be passed.")
-        (name,) = names
+        (name,) = check_passed(passed, only_one=True)
         if name == "touch":
             touches = self._read_touches(touch, sensor, background)
             return name, touches, len(touches.pixels)
-        check_unused(name, sensor=sensor, background=background)
+        check_unused("without `touch`", sensor=sensor, background=background)
         if name == "image":
             self._joint("image")
             pixel_values = self.processor.images(image)
@@ -193,11 +190,9 @@ class TouchToTextPipeline(UniTouchPipeline):
 
     def _tokenize(self, question: Any, count: int) -> list[list[int]]:
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
-        questions = check_texts("question", question)
-        if not all(text.strip() for text in questions):
-            raise InvalidInputError("`question` is blank; ask something.")
-        if len(questions) not in (1, count) and count > 1:
-            raise InvalidInputError(f"`question` holds {len(questions)} for {count} inputs; pass one, or one for each.")
+        questions = check_texts("question", question, blank=False)
+        if count > 1:
+            check_count("question", len(questions), count)
         texts = [self.config["prompt_template"].replace(QUESTION, text) for text in questions]
         chat = getattr(self.tokenizer, "chat_template", None) is not None  # which writes the special tokens itself
         if chat:
@@ -238,12 +233,9 @@ class TouchToTextPipeline(UniTouchPipeline):
 @contextmanager
 def option_errors(options: dict[str, Any]) -> Iterator[None]:
     """Re-raises option errors of `generate`."""
-    try:
+    kinds = (ValueError, TypeError, AttributeError) if options else ()
+    with explain_errors("`generate` cannot use its options", "pass others", *kinds):
         yield
-    except (ValueError, TypeError, AttributeError) as error:
-        if not options:
-            raise
-        raise InvalidInputError(f"`generate` cannot use its options: {first_line(error)}") from error
 
 
 @contextmanager

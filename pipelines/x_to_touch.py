@@ -14,11 +14,14 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_no
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
+    check_count,
+    check_equal,
     check_kind,
+    check_not_empty,
+    check_passed,
     check_tensor,
     check_texts,
     check_unused,
-    describe,
 )
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
@@ -29,7 +32,6 @@ from unitouch_gen.pipelines.base import (
     SensorNames,
     StepEndCallback,
     UniTouchPipeline,
-    check_count,
     check_weights,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
@@ -97,15 +99,13 @@ class XToTouchPipeline(UniTouchPipeline):
             default_num_inference_steps=default_num_inference_steps,
             default_timesteps=default_timesteps,
         )
-        if unet.config.class_embed_type is not None:
-            kind = unet.config.class_embed_type
-            raise InvalidInputError(f"`unet` takes class labels of the kind {kind!r}, as unCLIP's.")
+        check_equal("unet", "`class_embed_type`", unet.config.class_embed_type, None, "for labels of sensors")
         others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
         labels = unet.config.num_class_embeds or 0
-        if labels != len(sensors) + others:
-            raise InvalidInputError(f"`sensors` names {len(sensors)}, but `unet` has {labels - others} to be named.")
-        if others and (backgrounds is None or backgrounds.config["count"] != len(sensors)):
-            raise InvalidInputError("`backgrounds` of each of `sensors` is missing, which `unet` takes.")
+        check_equal("sensors", "length", len(sensors), labels - others, "as many as `unet` has labels of them")
+        if others:
+            stored = 0 if backgrounds is None else backgrounds.config["count"]
+            check_equal("backgrounds", "length", stored, len(sensors), "one for each of `sensors`")
 
     @property
     def embedding_dim(self) -> int:
@@ -206,7 +206,7 @@ class XToTouchPipeline(UniTouchPipeline):
         else:
             check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
             others = {**modalities, "weights": weights, "source_sensor": source_sensor, "bridge": bridge or None}
-            check_unused("condition_embeds", **others)
+            check_unused("with `condition_embeds`", **others)
             inputs = len(condition_embeds)
         backgrounds, sensors = self._read_sensors(sensor, background, inputs)
         batch_size = len(sensors)
@@ -318,23 +318,17 @@ class XToTouchPipeline(UniTouchPipeline):
         self, modalities: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
     ) -> tuple[Conditions, int]:
         """The modalities that were passed, read, with their weights; and the number of inputs, B."""
-        modalities = {name: value for name, value in modalities.items() if value is not None}
-        if not modalities:
-            raise InvalidInputError(
-                "No input was passed; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
-            )
+        modalities = check_passed(modalities)
         self._joint(next(iter(modalities)))
-        if source_sensor is not None and "touch" not in modalities:
-            raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
+        if "touch" not in modalities:
+            check_unused("without `touch`", source_sensor=source_sensor)
         inputs: dict[str, Any] = {}
         sizes: dict[str, int] = {}
         if "image" in modalities:
             inputs["image"] = {"pixel_values": self.processor.images(modalities["image"])}
             sizes["image"] = len(inputs["image"]["pixel_values"])
         if "text" in modalities:
-            for number, text in enumerate(check_texts("text", modalities["text"])):
-                if not text.strip():
-                    raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
+            check_texts("text", modalities["text"], blank=False)
             inputs["text"] = self.processor.text(modalities["text"])
             sizes["text"] = len(inputs["text"]["input_ids"])
         if "audio" in modalities:
@@ -364,8 +358,8 @@ class XToTouchPipeline(UniTouchPipeline):
         pictures: list[Tensor] = []
         if background is not None:
             if not self.takes_background:
-                raise InvalidInputError("`background` was passed, but this model takes none; leave it out.")
-            check_unused("background", sensor=sensor)  # a named sensor has its own
+                check_unused("on a model that takes none", background=background)
+            check_unused("with `background`", sensor=sensor)  # a named sensor has its own
             pictures = load_images("background", background)
             labels = [len(names)] * len(pictures)
         elif not names and self.takes_background:
@@ -373,14 +367,14 @@ class XToTouchPipeline(UniTouchPipeline):
         elif isinstance(sensor, str) and sensor == ALL:
             return [], list(range(max(len(names), 1))) * inputs
         elif not names:
-            if sensor is not None:
-                raise InvalidInputError(f"`sensor` is {describe(sensor)}, but this model draws one only; leave it out.")
+            check_unused("on a model that draws one only", sensor=sensor)
             labels = [0]
         else:
             chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
             hint = f"{ALL!r} draws each of them, in place of a name, not together with one."
             labels = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
-        if not labels or (inputs > 1 and len(labels) not in (1, inputs)):
-            name = "sensor" if background is None else "background"
-            raise InvalidInputError(f"`{name}` holds {len(labels)} for {inputs} inputs; pass one, or one each.")
+        name = "sensor" if background is None else "background"
+        check_not_empty(name, labels)
+        if inputs > 1:
+            check_count(name, len(labels), inputs)
         return pictures, labels * inputs if len(labels) == 1 else labels

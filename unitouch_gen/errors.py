@@ -10,7 +10,8 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
@@ -82,10 +83,8 @@ def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **opti
 
 def check_working_folder() -> None:
     """Raises if the working folder was deleted, since importing torch would then end the process."""
-    try:
+    with explain_errors("The working folder has been deleted", "change to one that is there", FileNotFoundError):
         os.getcwd()
-    except FileNotFoundError as error:
-        raise InvalidInputError("The working folder has been deleted; change to one that is there.") from error
 
 
 def expand_home(word: str) -> str:
@@ -110,6 +109,21 @@ def describe(value: Any) -> str:
 def first_line(error: BaseException) -> str:
     """The first line of an error's message, or its class if the message is empty."""
     return str(error).strip().partition("\n")[0] or type(error).__name__
+
+
+@contextmanager
+def explain_errors(problem: str, wanted: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turns errors of other libraries into an `InvalidInputError` with their first line, between problem and advice.
+
+    An `InvalidInputError` stays as it is.
+    """
+    try:
+        yield
+    except InvalidInputError:
+        raise
+    except kinds as error:
+        why = getattr(error, "strerror", None) or first_line(error).rstrip(".")
+        raise InvalidInputError(f"{problem} ({why}); {wanted}.") from error
 
 
 def needed(module: str, extra: str = "train") -> Any:
@@ -147,16 +161,15 @@ def check_kind(name: str, value: Any, *kinds: type) -> Any:
 
 def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     """An integer from `low` to `high`, as an int. Booleans are not integers here."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be an integer.")
-    check_number(name, value, low, high)
+    check_number(name, value, low, high, kind=Integral)
     return int(value)
 
 
-def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """A finite number from `low` to `high`, as a float. Booleans are not numbers here."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number.")
+def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, kind: type = Real) -> float:
+    """A finite number of a kind from `low` to `high`, as a float. Booleans are not numbers here."""
+    if isinstance(value, bool) or not isinstance(value, kind):
+        wanted = "an integer" if kind is Integral else "a number"
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {wanted}.")
     try:
         fits = math.isfinite(value) and low <= value <= high  # type: ignore[operator]
     except OverflowError:  # raised by integers beyond the range of floats
@@ -197,13 +210,25 @@ def check_fields(model: "type[Model]", values: Any, whole: str = "arguments") ->
         raise (InvalidTypeError if wrong_kind else InvalidInputError)(message) from error
 
 
-def check_texts(name: str, value: Any) -> list[str]:
-    """A string, or a list of at least one, as a list; each can be written in UTF-8."""
+def check_texts(name: str, value: Any, *, blank: bool = True, repeated: bool = True) -> list[str]:
+    """A string, or a list of at least one, as a list; each can be written in UTF-8.
+
+    With `blank` or `repeated` unset, there must be none of those.
+    """
     texts = [value] if isinstance(value, str) else value
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
-    if not texts or any("\ud800" <= letter <= "\udfff" for letter in "".join(texts)):  # from bytes in another encoding
-        raise InvalidInputError(f"`{name}` is {describe(value)}; pass at least one string, in UTF-8.")
+    wanted = ""
+    if not texts:
+        wanted = "pass at least one string"
+    elif any("\ud800" <= letter <= "\udfff" for letter in "".join(texts)):  # from bytes in another encoding
+        wanted = "pass texts in UTF-8"
+    elif not blank and not all(text.strip() for text in texts):
+        wanted = "pass texts that are not blank"
+    elif not repeated and len(set(texts)) < len(texts):
+        wanted = "pass each of them once"
+    if wanted:
+        raise InvalidInputError(f"`{name}` is {describe(value)}; {wanted}.")
     return list(texts)
 
 
@@ -226,33 +251,64 @@ def is_lfs_pointer(path: str | os.PathLike) -> bool:
 def check_file(name: str, path: str | os.PathLike, what: str) -> None:
     """Raises `InvalidInputError` if `what`, such as "an image file", cannot be opened or is a Git LFS pointer."""
     subject = f"`{name}` names {str(path)[:400]!r}, which"
-    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+    wanted = f"pass the path of {what}"
+    why = ""
+    if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        with explain_errors(f"{subject} cannot be opened", wanted, OSError):
+            if is_lfs_pointer(path):
+                why = "is a Git LFS pointer"
+                wanted = "run `git lfs pull` in its repository"
+    elif os.path.isdir(path):
+        why = "is a folder"
+    elif os.path.exists(path):
+        why = "is no file"
+    else:
         why = "does not exist"
-        if os.path.isdir(path):
-            why = "is a folder"
-        elif os.path.exists(path):
-            why = "is no file"
-        raise InvalidInputError(f"{subject} {why}; pass the path of {what}.")
-    try:
-        pointer = is_lfs_pointer(path)
-    except OSError as error:
-        raise InvalidInputError(f"{subject} cannot be opened: {error.strerror}; pass the path of {what}.") from error
-    if pointer:
-        raise InvalidInputError(f"{subject} is a Git LFS pointer to {what}; run `git lfs pull` in its repository.")
+    if why:
+        raise InvalidInputError(f"{subject} {why}; {wanted}.")
 
 
-def check_unused(instead: str, **arguments: Any) -> None:
-    """Raises if one of the arguments has a value, which has no effect together with `instead`."""
+def check_count(name: str, count: int, inputs: int) -> None:
+    """Raises unless there is one for all of the inputs, or one for each."""
+    if count not in (1, inputs):
+        raise InvalidInputError(f"`{name}` holds {count} for {inputs} inputs; pass one, or one each.")
+
+
+def check_not_empty(name: str, values: Sized) -> None:
+    """Raises if a list is empty."""
+    if len(values) == 0:
+        raise InvalidInputError(f"`{name}` is an empty list; pass at least one.")
+
+
+def check_equal(name: str, what: str, value: Any, expected: Any, why: str) -> None:
+    """Raises unless a property of an argument, such as its "width", is what something else needs; `why` says what."""
+    if value != expected:
+        raise InvalidInputError(f"`{name}` has {what} {describe(value)}; it has to be {describe(expected)}, {why}.")
+
+
+def check_passed(arguments: Mapping[str, Any], *, only_one: bool = False) -> dict[str, Any]:
+    """The arguments that have a value: at least one of them, or `only_one`."""
+    passed = {name: value for name, value in arguments.items() if value is not None}
+    if not passed or (only_one and len(passed) > 1):
+        names = ", ".join(f"`{name}`" for name in arguments)
+        have = " and ".join(f"`{name}`" for name in passed) or "None"
+        raise InvalidInputError(f"{have} of {names} was passed; pass {'exactly' if only_one else 'at least'} one.")
+    return passed
+
+
+def check_unused(where: str, **arguments: Any) -> None:
+    """Raises if one of the arguments has a value; none has an effect `where`, such as "with `touch_embeds`"."""
     for name, value in arguments.items():
         if value is not None:
-            raise InvalidInputError(f"`{name}` is {describe(value)}, but has no effect with `{instead}`; pass one.")
+            raise InvalidInputError(f"`{name}` is {describe(value)}, but has no effect {where}; leave it out.")
 
 
 def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     """A tensor of finite values; the message counts the others."""
     not_finite = int((~tensor.isfinite()).sum())
     if not_finite:
-        raise InvalidInputError(f"`{name}` holds {not_finite} of {tensor.numel()} values that are NaN or infinite.")
+        counts = f"{not_finite} of {tensor.numel()} values"
+        raise InvalidInputError(f"`{name}` holds {counts} that are NaN or infinite; pass finite ones.")
     return tensor
 
 
@@ -265,12 +321,9 @@ def check_tensor(name: str, value: Any, *shape: int | str, finite: bool = True) 
     is_dense = isinstance(value, torch.Tensor) and value.layout == torch.strided and not value.is_meta
     if not is_dense or not value.is_floating_point():
         raise InvalidTypeError(message)
-    if len(shape) != value.ndim:
+    fits = [size >= 1 if isinstance(wanted, str) else size == wanted for wanted, size in zip(shape, value.shape)]
+    if len(shape) != value.ndim or not all(fits):
         raise InvalidInputError(message)
-    for expected, size in zip(shape, value.shape, strict=True):
-        fits = size >= 1 if isinstance(expected, str) else size == expected
-        if not fits:
-            raise InvalidInputError(message)
     return check_finite(name, value) if finite else value
 
 

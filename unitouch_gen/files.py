@@ -15,7 +15,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, check_file, check_kind, describe, first_line, is_lfs_pointer
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_file,
+    check_kind,
+    describe,
+    explain_errors,
+    first_line,
+    is_lfs_pointer,
+)
 
 try:
     import fcntl
@@ -160,24 +168,27 @@ def finish_save(folder: Path) -> None:
     """
     if not is_unfinished(folder):
         return
-    try:
-        plan = json.loads((folder / UNFINISHED).read_text())
-        moves = [(folder / hidden, folder / destination) for hidden, destination in plan["moves"]]
-        removed = [folder / name for name in plan["removed"]]
-        names = [name for move in plan["moves"] for name in move] + list(plan["removed"])
-    except (ValueError, TypeError, LookupError) as error:
-        raise InvalidInputError(f"`{folder / UNFINISHED}` is no plan of a save; save again.") from error
-    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in names):
-        raise InvalidInputError(f"`{folder / UNFINISHED}` leads out of its folder.")
+    file = folder / UNFINISHED
+    with explain_errors(f"`{file}` is no plan of a save", "save again", ValueError, TypeError, LookupError):
+        plan = json.loads(file.read_text())
+        moves = [(path_inside(folder, hidden), path_inside(folder, place)) for hidden, place in plan["moves"]]
+        removed = [path_inside(folder, name) for name in plan["removed"]]
     for hidden, destination in moves:
         if os.path.lexists(hidden):  # it has not been moved yet
             os.replace(hidden, destination)
     real_folder = os.path.realpath(folder)
-    for file in removed:
+    for older in removed:
         # A plan in a downloaded folder could name files behind a link.
-        if os.path.commonpath([real_folder, os.path.realpath(file.parent)]) == real_folder:
-            file.unlink(missing_ok=True)
-    (folder / UNFINISHED).unlink()
+        if os.path.commonpath([real_folder, os.path.realpath(older.parent)]) == real_folder:
+            older.unlink(missing_ok=True)
+    file.unlink()
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """A path below a folder, by its name there; raises for a name that leads out of the folder."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InvalidInputError(f"{name!r} leads out of `{folder}`; name a place in it.")
+    return folder / name
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
@@ -207,11 +218,10 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     for option in names:
         if options.get(option) is not None:
             download_options[option] = options[option]
-    try:
+    problem = f"`{name}` is {str(place)!r}, no folder here, and no repository that can be fetched"
+    kinds = (OSError, ValueError, ImportError)  # ValueError: no id; ImportError: a SOCKS proxy
+    with explain_errors(problem, "pass a folder, or a repository id", *kinds):
         return Path(snapshot_download(str(place), **download_options))
-    except (OSError, ValueError, ImportError) as error:  # ValueError: no id; ImportError: a SOCKS proxy
-        why = f"no folder here, and no repository that can be fetched: {first_line(error)}"
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, {why}") from error
 
 
 def natural(path: str | Path) -> list[Any]:
@@ -277,13 +287,12 @@ def is_hidden(path: Path) -> bool:
 
 def read_text(file: Path) -> str:
     """A text in UTF-8, or in UTF-16 as spreadsheets write it; empty if there is no file."""
-    content = file.read_bytes() if file.is_file() else b""
-    if file.is_file() and is_lfs_pointer(file):
-        raise InvalidInputError(f"{str(file)!r} is a Git LFS pointer; run `git lfs pull` in its repository.")
-    try:
+    if not file.is_file():
+        return ""
+    check_file(file.name, file, "a text")
+    content = file.read_bytes()
+    with explain_errors(f"{str(file)!r} is not in UTF-8", "save it as UTF-8", UnicodeDecodeError):
         return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{str(file)!r} is not in UTF-8; save it as UTF-8.") from error
 
 
 def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str, str]]:
@@ -339,14 +348,9 @@ def _check_cells(file: Path, names: Sequence[str], cells: Sequence[Sequence[str]
 def read_settings(name: str, file: Path, parse: Callable[[str], Any] = json.loads) -> dict[str, Any]:
     """The settings in a file in UTF-8: JSON, or another format with its parser."""
     check_file(name, file, "a settings file")
-    try:
-        settings = parse(file.read_text(encoding="utf-8"))
-        if not isinstance(settings, dict):
-            raise ValueError(f"it holds {describe(settings)} and no settings")
-    except Exception as error:  # parsers raise many kinds of errors
-        why = first_line(error)
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read: {why}.") from error
-    return settings
+    problem = f"`{name}` names {str(file)!r}, which cannot be read"
+    with explain_errors(problem, "pass a whole file of settings", Exception):  # parsers raise many kinds of errors
+        return check_kind("content", parse(file.read_text(encoding="utf-8")), dict)
 
 
 SAVED_FILES = {

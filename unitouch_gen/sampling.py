@@ -29,6 +29,7 @@ from unitouch_gen.errors import (
     check_kind,
     check_unused,
     describe,
+    explain_errors,
 )
 from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised, to_prediction
 from unitouch_gen.solvers import DIVERGED_RMS, SOLVERS, Callback, sample_adaptive
@@ -131,14 +132,13 @@ def prepare_steps(
     share = arguments.init_strength
     if arguments.tolerance is not None:
         others = {"num_inference_steps": steps, "timesteps": arguments.timesteps, "solver": solver}
-        check_unused("tolerance", **others, eta=arguments.eta or None)
+        check_unused("with `tolerance`", **others, eta=arguments.eta or None)
         schedule = NoiseSchedule.of(scheduler)
         return [schedule.karras_level(1.0 - share), schedule.sigma_min], schedule
-    if arguments.max_evaluations is not None:
-        raise InvalidInputError(f"`max_evaluations` is {arguments.max_evaluations}; it applies only with `tolerance`.")
+    check_unused("without `tolerance`", max_evaluations=arguments.max_evaluations)
     train_timesteps = scheduler.config.get("num_train_timesteps", 1000)
     if arguments.timesteps is not None:
-        check_unused("timesteps", num_inference_steps=steps, solver=solver)
+        check_unused("with `timesteps`", num_inference_steps=steps, solver=solver)
         timesteps = [check_integer("timesteps", timestep, 0, train_timesteps - 1) for timestep in arguments.timesteps]
         if not timesteps or timesteps != sorted(set(timesteps), reverse=True):
             raise InvalidInputError(f"`timesteps` is {describe(timesteps)}; each has to be below the one before.")
@@ -148,8 +148,8 @@ def prepare_steps(
     if solver is None:
         return prepare_scheduler(scheduler, steps, share, device), None
     check_choice("solver", solver, SOLVERS)
-    if arguments.eta > 0.0 and not SOLVERS[solver].adds_noise:
-        raise InvalidInputError(f"`eta` is {arguments.eta:g}, but {solver!r} adds no noise; pass solver='ddim'.")
+    if not SOLVERS[solver].adds_noise:
+        check_unused(f"with {solver!r}, which adds no noise", eta=arguments.eta or None)
     schedule = NoiseSchedule.of(scheduler)
     return [*SOLVERS[solver].spacing(schedule, steps, share), 0.0], schedule
 
@@ -165,14 +165,13 @@ def prepare_scheduler(scheduler: Any, steps: int | list[int], init_strength: flo
         raise InvalidInputError(
             f"`{argument}` is {steps}, but {kind} chooses its own; pass `num_inference_steps` instead."
         )
-    try:
+    problem = f"`{argument}` is {steps}, which {kind} cannot run"
+    with explain_errors(problem, "take other steps, or name a `solver`", ValueError, IndexError, ZeroDivisionError):
         if "strength" in parameters:  # of LCM and TCD
             options["strength"] = init_strength
         elif init_strength < 1.0:
             scheduler = truncate_schedule(scheduler, init_strength)
         scheduler.set_timesteps(**options)
-    except (ValueError, IndexError, ZeroDivisionError) as error:
-        raise InvalidInputError(f"`{argument}` is {steps}, which {kind} cannot run: {error}") from error
     first = float(scheduler.timesteps.max())
     levels = scheduler.config.num_train_timesteps
     # "leading" spacing starts too low with 1 step, or too high with 1000
@@ -191,7 +190,7 @@ def truncate_schedule(scheduler: Any, share: float) -> Any:
     config = scheduler.config
     betas = getattr(scheduler, "betas", None)
     if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
-        raise ValueError(f"it starts at noise alone; pass no `init_strength`, which is {share:g}, or name a `solver`")
+        check_unused("with a scheduler that starts at noise alone", init_strength=share)
     scheduler.set_timesteps(100)
     spacing = scheduler.timesteps.unique()  # from the smallest
     levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)

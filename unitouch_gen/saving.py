@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, check_arguments
+from unitouch_gen.errors import check_arguments, explain_errors
 from unitouch_gen.files import (
     UNFINISHED,
     as_path,
@@ -79,12 +79,10 @@ def filling(name: str, folder: Path) -> Iterator[Path]:
                 with suppress(OSError):  # raised if another process has filled the folder
                     target.rmdir()
             raise
-    try:
-        with locked(target):
-            finish_save(target)
-    except OSError as error:
-        why = f"{error.strerror}. The files are there under hidden names, and take their places when it is read."
-        raise InvalidInputError(f"`{name}` was written in part to {str(target)!r}: {why}") from error
+    problem = f"`{name}` was written in part to {str(target)!r}"
+    wanted = "the files are there under hidden names, and take their places when it is read"
+    with explain_errors(problem, wanted, OSError), locked(target):
+        finish_save(target)
     shutil.rmtree(staging, ignore_errors=True)
 
 

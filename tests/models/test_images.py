@@ -267,7 +267,7 @@ REFUSED = [
     *((bad(value), "holds 1 of 768 values that are NaN or infinite") for value in (np.nan, -np.inf)),
     *((bad(*values), RANGE) for values in ((1.5,), (-0.1,), (300, int), (-1, int), (2**63, np.uint64), (1e300, float))),
     (torch.full((3, 16, 16), 255.0), RANGE),
-    *((Image.fromarray(np.full((16, 16), value, np.int32)), "from 0 to 65535") for value in (-1, 70_000)),
+    *((Image.fromarray(np.full((16, 16), value, np.int32)), "0 to 255, or to 65535") for value in (-1, 70_000)),
     (Image.fromarray(np.full((16, 16), 99.0, np.float32)), RANGE),
     *((np.zeros(shape), SHAPE) for shape in ((16, 16, 2), (3, 16, 16), (16,), (1, 1, 16, 16, 3), (0, 16, 16, 3))),
     *((torch.zeros(shape), SHAPE) for shape in ((16, 16), (4, 16, 16), (16, 16, 3), (0, 3, 16, 16))),

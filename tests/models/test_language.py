@@ -116,7 +116,7 @@ def test_gradients_reach_all_of_the_bridge_and_it_alone(parts, checkpointed):
 def test_a_language_model_that_does_not_fit_and_adapters_out_of_range_are_refused(parts):
     bridge, model = parts
     for change, words in (
-        ({"num_hidden_layers": 3}, "`num_layers` 2, but the language model 3"),
+        ({"num_hidden_layers": 3}, "num_layers` 2; it has to be 3"),
         ({"hidden_size": 64, "head_dim": 8}, "`hidden_size` 32"), ({"num_attention_heads": 2}, "`num_heads` 4"),
     ):  # fmt: skip
         with pytest.raises(InvalidInputError, match=words):

@@ -47,7 +47,7 @@ def test_sensors_without_prototypes_are_named_but_never_retrieved() -> None:
 def test_a_bank_of_none_matches_none() -> None:
     bank = SensorBank((), 5, 16, 8)
     assert bank.match(torch.rand(2, 3, 8, 8)) == [SensorMatch(None, None)] * 2
-    with pytest.raises(InvalidInputError, match="no sensor tokens"):
+    with pytest.raises(InvalidInputError, match="without sensor tokens"):
         bank.match(torch.rand(2, 3, 8, 8), "digit")
 
 

@@ -142,7 +142,7 @@ NON_FINITE = [np.where(np.arange(RATE) == 7, value, NOISE.astype(np.float64)) fo
 REFUSED: list[tuple[object, str]] = [
     *(("nothing.wav", "names '.*nothing.wav', which does not exist"), ("", "names .*which is a folder")),
     *((name, "names .*cannot be read as a sound") for name in FILES),
-    *(((samples, RATE), "holds samples that are NaN or infinite") for samples in NON_FINITE),
+    *(((samples, RATE), "holds .* values that are NaN or infinite") for samples in NON_FINITE),
     (NOISE, "without a sampling rate"),
     ((32_767 * NOISE, RATE), "holds samples up to 32767; floats run from -1 to 1"),
     *(((NOISE, rate), f"sampling rate` is {rate}") for rate in (999, 768_001, 16_000.0, True)),

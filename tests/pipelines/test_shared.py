@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from tests.helpers.calls import Call, quiet, seeded, watched
 from tests.helpers.exact import ExactUNet
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+from unitouch_gen.errors import InvalidTypeError, NonFiniteError
 from unitouch_gen.numerics.problems import PROBLEMS, relative_rms
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.pipelines.base import threads_for
@@ -97,12 +97,6 @@ def test_calls_at_the_same_time_leave_the_number_of_threads_to_others_as_it_was(
             assert pool.submit(torch.get_num_threads).result() == torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
-
-
-def test_a_pipeline_without_numbers_is_refused(call):
-    call.pipe.to("meta")
-    with pytest.raises(InvalidInputError, match="on the device 'meta'"):
-        call()
 
 
 @pytest.mark.parametrize("solver", [None, "dpm++2m"])

@@ -125,7 +125,7 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(ask, tou
 
 @pytest.mark.parametrize("option", [{"top_k": -1, "do_sample": True}, {"streamer": 3}, {"logits_processor": [3]}])
 def test_what_transformers_refuses_is_told_in_its_words(ask, option):
-    with pytest.raises(InvalidInputError, match=r"`generate` cannot use its options: .{10}"):
+    with pytest.raises(InvalidInputError, match=r"`generate` cannot use its options \(.{10}"):
         ask(touch_embeds=EMBEDS[:1], question=QUESTION, **option)
 
 
@@ -134,12 +134,12 @@ def test_parts_that_do_not_fit_are_refused(components):
     joint = {name: components[name] for name in ("unitouch", "processor")}
     for words, change in (
         (
-            "`unitouch` has width 16, but `language_bridge` takes 8",
+            "`unitouch` has width 16; it has to be 8, as `language_bridge` takes",
             {"language_bridge": LanguageBridge.for_model(parts["language_model"], 8), **joint},
         ),
         ("`prompt_template` is 'Answer'", {"prompt_template": "Answer"}),
     ):
         with pytest.raises(InvalidInputError, match=words):
             TouchToTextPipeline(**{**parts, **change})
-    with pytest.raises(InvalidInputError, match="`touch` needs the joint space"):
+    with pytest.raises(InvalidInputError, match="`touch` needs `unitouch`"):
         TouchToTextPipeline(**parts)(torch.rand(3, 32, 32), QUESTION)

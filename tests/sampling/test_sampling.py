@@ -44,7 +44,7 @@ def test_steps_that_cannot_be_made_are_refused():
         ({"solver": "ddim", "scheduler": diffusers.FlowMatchEulerDiscreteScheduler()}, "has no noise levels"),
         ({"num_inference_steps": 1001}, "`num_inference_steps` is 1001"),
         ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but has no effect with `tolerance`"),
-        ({"solver": "euler", "eta": 0.5}, "`eta` is 0.5, but 'euler' adds no noise"),
+        ({"solver": "euler", "eta": 0.5}, "`eta` is 0.5, but has no effect with 'euler'"),
         ({"tolerance": 0.1, "max_evaluations": 1}, "`max_evaluations` is 1"),
         ({"timesteps": [9], "solver": "heun"}, "`solver` is 'heun', but has no effect with `timesteps`"),
         ({"timesteps": [9], "tolerance": 0.1}, "`timesteps` is .* no effect with `tolerance`"),

@@ -95,8 +95,8 @@ GOOD = ball(4.0, 10.0)
 BAD_MAPS = [
     (np.zeros((50, 50)), "is flat; pass a relief"),
     (np.full((50, 50), 7, np.uint8), "is flat; pass a relief"),
-    (np.where(GOOD > 3.9, np.nan, GOOD), "that are NaN or infinite; fill them"),
-    (np.where(GOOD > 3.9, np.inf, GOOD), "that are NaN or infinite; fill them"),
+    (np.where(GOOD > 3.9, np.nan, GOOD), "that are NaN or infinite"),
+    (np.where(GOOD > 3.9, np.inf, GOOD), "that are NaN or infinite"),
     (np.ones((1, 1)), "is 1 x 1 pixels; pass a map of 8 to 8192"),
     (np.broadcast_to(np.uint8(3), (10_000, 10_000)), "is 10000 x 10000 pixels; pass a map of 8 to 8192"),
     (np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8), "is in colours; pass a grey height map"),

@@ -204,8 +204,6 @@ class UniTouchConfig(PreTrainedConfig):
         stem = check_choice("vision_config.stem", getattr(vision, "stem", "patch"), ("patch", "residual"))
         if stem == "residual":
             check_halved(vision.patch_size, vision.image_size)
-        self.sensors = check_texts("sensors", self.sensors) if self.sensors else []
+        self.sensors = check_texts("sensors", self.sensors, repeated=False) if self.sensors else []
         for name, reach in check_kind("sensor_reaches", self.sensor_reaches, dict).items():
             check_number(f"sensor_reaches[{name!r}]", reach, 0.0)
-        if len(set(self.sensors)) != len(self.sensors):
-            raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")

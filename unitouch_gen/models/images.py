@@ -16,7 +16,15 @@ from PIL import ExifTags, Image, ImageCms, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_finite, describe, first_line
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_file,
+    check_finite,
+    check_not_empty,
+    describe,
+    explain_errors,
+)
 from unitouch_gen.models.formats import content_kind
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
@@ -47,8 +55,7 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
     """
     if not isinstance(images, list | tuple):
         return _load(name, images)
-    if not images:
-        raise InvalidInputError(f"`{name}` is an empty list; pass at least one image.")
+    check_not_empty(name, images)
     tensors = list[Tensor]()
     for index, item in enumerate(images):
         tensors += _load(f"{name}[{index}]", item)
@@ -65,11 +72,24 @@ def _load(name: str, image: Any) -> list[Tensor]:
     if isinstance(image, Image.Image):
         _check_size(name, *image.size)  # before pixels are decoded
         image = _decoded(subject, image)
-    if isinstance(image, np.ndarray):
-        image = _channels_first(name, image)
-    if isinstance(image, Tensor):
-        return _checked(name, image.detach())
-    raise InvalidTypeError(f"`{name}` is {describe(image)}; pass a path, PIL image, array (H, W, 3), tensor (3, H, W).")
+    pixels = None
+    if isinstance(image, np.ndarray) and image.dtype.kind in "uifb":
+        pixels = _channels_first(subject, image)
+    elif isinstance(image, Tensor) and _is_dense_and_real(image):
+        pixels = image.detach()
+    if pixels is None:
+        wanted = "pass a path, PIL image, array (H, W, 3) or tensor (3, H, W) of real numbers"
+        raise InvalidTypeError(f"{subject} is {describe(image)}; {wanted}.")
+    pixels = pixels[None] if pixels.ndim == 3 else pixels
+    if pixels.ndim != 4 or pixels.shape[1] not in (1, 3) or len(pixels) == 0:
+        wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), a tensor (3, H, W) or (B, 3, H, W)"
+        raise InvalidInputError(f"{subject} is {describe(image)}; {wanted}.")
+    _check_size(name, pixels.shape[3], pixels.shape[2])
+    return list(_in_range(name, pixels.cpu()).expand(-1, 3, -1, -1))
+
+
+def _is_dense_and_real(tensor: Tensor) -> bool:
+    return tensor.layout == torch.strided and not (tensor.is_meta or tensor.is_complex() or tensor.is_quantized)
 
 
 def _read(subject: str, file: str) -> Image.Image | np.ndarray:
@@ -89,18 +109,15 @@ def _read(subject: str, file: str) -> Image.Image | np.ndarray:
 @contextmanager
 def _reading_errors(subject: str) -> Iterator[None]:
     """Turns whatever Pillow's plugins raise on broken files into an `InvalidInputError`."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `_check_size` is stricter
-            warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # warnings on broken EXIF
-            yield
-    except InvalidInputError:
-        raise
-    except Exception as error:
-        too_large = isinstance(error, Image.DecompressionBombError)
-        wanted = "a smaller one" if too_large else "a whole PNG, JPEG or other image file"
-        message = f"{subject} cannot be read as an image ({first_line(error)}); pass {wanted}."
-        raise InvalidInputError(message) from error
+    problem = f"{subject} cannot be read as an image"
+    with (
+        explain_errors(problem, "pass a whole PNG, JPEG or other image file", Exception),
+        explain_errors(problem, "pass a smaller one", Image.DecompressionBombError),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `_check_size` is stricter
+        warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # warnings on broken EXIF
+        yield
 
 
 def _open_png(content: bytes) -> Image.Image:
@@ -180,11 +197,13 @@ def _upright(image: Any) -> Any:
 
 
 def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
-    """Integers as uint8, or float32 in [0, 1], scaled by the fewest of 8, 10, 12, 14 or 16 bits that hold them."""
-    low = int(values.min())
+    """Integers as uint8, or float32 in [0, 1], scaled by the fewest of 8, 10, 12, 14 or 16 bits that hold them.
+
+    Those out of this range stay as they are, and are refused.
+    """
     high = int(values.max())
-    if low < 0 or high >= 1 << 16:
-        raise InvalidInputError(f"{subject} holds values from {low} to {high}; integers run from 0 to 65535.")
+    if int(values.min()) < 0 or high >= 1 << 16:
+        return values.astype(np.int64)
     bits = min(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
     full_scale = 2**bits - 1
     if bits < 16:
@@ -194,45 +213,32 @@ def _by_range(subject: str, values: np.ndarray) -> np.ndarray:
     return (values / full_scale).astype(np.float32)
 
 
-def _channels_first(name: str, array: np.ndarray) -> Tensor:
+def _channels_first(subject: str, array: np.ndarray) -> Tensor:
     """An array (..., H, W, C) as a tensor (..., C, H, W) that shares no memory with it."""
-    kind = array.dtype.kind
-    if kind not in "uifb":
-        raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
     pixels = array[..., None] if array.ndim == 2 else array
-    if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
-        wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
-        raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
-    has_16_bits = kind in "ui" and array.dtype.itemsize == 2
+    has_16_bits = array.dtype.kind in "ui" and array.dtype.itemsize == 2
     if has_16_bits and array.size and array.max() > 255:
-        pixels = _by_range(f"`{name}`", pixels)
+        pixels = _by_range(subject, pixels)
     elif array.dtype != np.uint8:
-        pixels = pixels.astype(np.float64 if kind in "fb" else np.int64)
-    return torch.from_numpy(pixels.copy()).movedim(-1, -3)
+        pixels = pixels.astype(np.float64 if array.dtype.kind in "fb" else np.int64)
+    tensor = torch.from_numpy(pixels.copy())
+    return tensor.movedim(-1, -3) if tensor.ndim > 2 else tensor
 
 
-def _checked(name: str, tensor: Tensor) -> list[Tensor]:
-    """A tensor (3, H, W) or (B, 3, H, W) as images, uint8 or float32 in [0, 1]."""
-    if tensor.layout != torch.strided or tensor.is_meta or tensor.is_complex() or tensor.is_quantized:
-        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be dense and hold real numbers.")
-    tensor = tensor[None] if tensor.ndim == 3 else tensor
-    if tensor.ndim != 4 or tensor.shape[1] not in (1, 3) or len(tensor) == 0:
-        wanted = "a tensor has to be (3, H, W) or (B, 3, H, W), with 1 or 3 channels"
-        raise InvalidInputError(f"`{name}` is {describe(tensor)}; {wanted}.")
-    _check_size(name, tensor.shape[3], tensor.shape[2])
-    tensor = tensor.cpu()
-    if tensor.dtype != torch.uint8:
-        are_integers = not (tensor.is_floating_point() or tensor.dtype == torch.bool)
-        values = tensor.long() if are_integers else check_finite(name, tensor).float()
-        low = values.min().item()
-        high = values.max().item()
-        if low < 0 or high > (255 if are_integers else 1):
-            raise InvalidInputError(
-                f"`{name}` holds values from {low:g} to {high:g}; float images run from 0 to 1 and integer images from "
-                "0 to 255."
-            )
-        tensor = values.byte() if are_integers else values
-    return list(tensor.expand(-1, 3, -1, -1))
+def _in_range(name: str, pixels: Tensor) -> Tensor:
+    """Pixels as uint8, or float32 in [0, 1]; raises for values outside of their range."""
+    if pixels.dtype == torch.uint8:
+        return pixels
+    are_integers = not (pixels.is_floating_point() or pixels.dtype == torch.bool)
+    values = pixels.long() if are_integers else check_finite(name, pixels).float()
+    low = values.min().item()
+    high = values.max().item()
+    if low < 0 or high > (255 if are_integers else 1):
+        raise InvalidInputError(
+            f"`{name}` holds values from {low:g} to {high:g}; float images run from 0 to 1 and integer images from "
+            "0 to 255, or to 65535 in grey images of 16 bits."
+        )
+    return values.byte() if are_integers else values
 
 
 def _check_size(name: str, width: int, height: int) -> None:

@@ -22,6 +22,7 @@ from unitouch_gen.errors import (
     check_choice,
     check_dtype,
     check_file,
+    explain_errors,
 )
 from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, reading
 from unitouch_gen.models.config import UniTouchConfig
@@ -290,8 +291,7 @@ class UniTouchModel(PreTrainedModel):
         dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder
         with reading(name, source):
-            if not (source / "config.json").is_file():
-                raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
+            check_file(name, source / "config.json", "the folder of a saved model")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
             model.source = source
             model._stored = stored_tensors(source, variant)
@@ -322,11 +322,9 @@ def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor
         }  # names alone, so that no file is outside of the folder
     tensors = dict[str, Tensor]()
     for file in sorted(folder / name for name in names):
-        try:
-            check_file("source", file, "weights")  # opening a pipe would block
+        check_file("source", file, "weights")  # opening a pipe would block
+        with explain_errors(f"`{file}` is cut off or damaged", "fetch it again", SafetensorError, OSError):
             tensors |= load_file(file)
-        except (SafetensorError, OSError, InvalidInputError) as error:
-            raise InvalidInputError(f"`{file}` cannot be read: {error}. It is missing, cut off or damaged.") from error
     return tensors
 
 

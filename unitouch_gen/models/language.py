@@ -15,7 +15,7 @@ from diffusers.configuration_utils import register_to_config
 from torch import Tensor, nn
 from transformers import PreTrainedModel
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_equal
 from unitouch_gen.saving import saved_whole
 
 
@@ -111,12 +111,7 @@ class LanguageBridge(ModelMixin, ConfigMixin):
             "num_heads": config.num_attention_heads,
         }
         for name, size in sizes.items():
-            own_size = self.config[name]
-            if own_size != size:
-                raise InvalidInputError(
-                    f"`language_bridge` has `{name}` {own_size}, but the language model {size}; pass the bridge that "
-                    "was made for it."
-                )
+            check_equal("language_bridge", f"`{name}`", self.config[name], size, "as the language model has")
         return attentions
 
     def attach(self, language_model: PreTrainedModel, embeds: Tensor) -> ExitStack:

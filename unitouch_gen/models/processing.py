@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
-from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_arguments, check_integer, check_kind, check_texts
 from unitouch_gen.files import LOADING_OPTIONS, check_saved, local_folder, reading
@@ -154,8 +153,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         settings = {"allow_patterns": ["*.json", "*.txt"], **kwargs}
         folder = local_folder(name, pretrained_model_name_or_path, **settings) / kwargs.pop("subfolder", "")
         with reading(name, folder):
-            if not (folder / FEATURE_EXTRACTOR_NAME).is_file():
-                raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
+            check_saved(folder, "processor")
             processor = super().from_pretrained(folder, **kwargs)
         if any((folder / file).is_file() for file in ("tokenizer_config.json", "tokenizer.json", "vocab.json")):
             processor.tokenizer = read_tokenizer(name, folder)

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import NoneType
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, check_choice, check_count, check_kind, check_unused
 
 Sensors = str | Sequence[str | None] | None
 """A name for all images, one for each, or `None` to retrieve them."""
@@ -67,7 +68,7 @@ class SensorBank(nn.Module):
     def index(self, name: str) -> int:
         """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
         if not self.names:
-            raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
+            check_unused("on a model without sensor tokens", sensor=name)
         hint = "For the touches of any other, leave `sensor` out." if bool(self.known.any()) else ""
         return self.names.index(check_choice("sensor", name, self.names, hint=hint))
 
@@ -87,12 +88,11 @@ class SensorBank(nn.Module):
         The sensor with the nearest prototype is retrieved, by L1 distance (as in the paper) of the mean colours of
         8 x 8 cells. If the bank has `reaches`, an image out of reach of all sensors has none, unless `nearest` is set.
         """
-        if not (sensor is None or isinstance(sensor, str | list | tuple)):
-            raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
-        names = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
-        if len(names) != len(raw_pixels):
-            counts = f"a list of {len(names)} for {len(raw_pixels)} touch images"
-            raise InvalidInputError(f"`sensor` is {counts}; pass one name, one each, or None to retrieve them.")
+        check_kind("sensor", sensor, str, list, tuple, NoneType)
+        names = list(sensor) if isinstance(sensor, list | tuple) else [sensor]
+        check_count("sensor", len(names), len(raw_pixels))
+        if len(names) == 1:
+            names = names * len(raw_pixels)
         indices = [None if name is None else self.index(name) for name in names]
         if not self.names:
             return [SensorMatch(None, None)] * len(raw_pixels)

@@ -16,7 +16,16 @@ from scipy.signal import resample_poly
 from torch import Tensor
 from transformers.audio_utils import mel_filter_bank, spectrogram
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_file, check_integer, check_number, describe
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_file,
+    check_finite,
+    check_integer,
+    check_not_empty,
+    check_number,
+    describe,
+)
 from unitouch_gen.models.formats import file_kind
 
 AudioInput = Any  # a path, samples with their rate, or a list of them
@@ -44,8 +53,7 @@ def load_sounds(name: str, sounds: AudioInput) -> list[Sound]:
     """
     if not isinstance(sounds, list):
         return [_load(name, sounds)]
-    if not sounds:
-        raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
+    check_not_empty(name, sounds)
     return [_load(f"{name}[{i}]", sound) for i, sound in enumerate(sounds)]
 
 
@@ -70,8 +78,7 @@ def _load(name: str, sound: Any) -> Sound:
     full_scale = _full_scale(name, samples)
     with np.errstate(all="ignore"):
         mono = (_mono(samples) / full_scale).astype(np.float32)
-    if not np.isfinite(mono).all():
-        raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
+    check_finite(name, torch.from_numpy(mono))
     peak = np.abs(mono).max()
     if peak > 100:
         raise InvalidInputError(f"`{name}` holds samples up to {peak:g}; floats run from -1 to 1, or pass integers.")
@@ -114,11 +121,7 @@ def _read(name: str, file: str | os.PathLike) -> tuple[np.ndarray, int]:
     check_file(name, file, "a sound file")
     try:
         samples, rate = soundfile.read(os.fsencode(file), dtype="float32", always_2d=True)
-    except (
-        soundfile.LibsndfileError,
-        OSError,
-        MemoryError,
-    ) as error:  # MemoryError: a forged header may claim any length
+    except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # the last of a header with a forged length
         reason = f"which cannot be read as a sound ({file_kind(file)})"
         message = f"`{name}` names {str(file)!r}, {reason}; pass a wav, flac, ogg or mp3 file."
         raise InvalidInputError(message) from error

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_file, first_line, needed
+from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_file, explain_errors, needed
 from unitouch_gen.models.images import ImageInput, load_images
 
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
@@ -291,17 +291,18 @@ def read_video(name: str, place: str | os.PathLike) -> Iterator[np.ndarray]:
     place = os.path.expanduser(place)
     check_file(name, place, "a video")
     options = {"protocol_whitelist": "file"}  # playlists of other places are not followed
-    try:
+    kinds = (undecodable, OSError, ValueError, IndexError)  # IndexError: no video stream
+    with (
+        explain_errors(f"`{name}` is {str(place)!r}, which is no video", "pass a whole mp4, avi or similar", *kinds),
         # An absolute path, since 10:30.mp4 would be read as a protocol.
-        with av.open(os.path.abspath(place), options=options) as container:
-            for packet in container.demux(video=0):
-                try:
-                    decoded = packet.decode()
-                except undecodable:
-                    continue
-                aspect = float(container.streams.video[0].sample_aspect_ratio or 1)
-                for frame in decoded:
-                    pixels = frame.to_ndarray(format="rgb24", width=round(frame.width * aspect))
-                    yield np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
-    except (undecodable, OSError, ValueError, IndexError) as error:  # IndexError: no video stream
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no video ({first_line(error)}).") from error
+        av.open(os.path.abspath(place), options=options) as container,
+    ):
+        for packet in container.demux(video=0):
+            try:
+                decoded = packet.decode()
+            except undecodable:
+                continue
+            aspect = float(container.streams.video[0].sample_aspect_ratio or 1)
+            for frame in decoded:
+                pixels = frame.to_ndarray(format="rgb24", width=round(frame.width * aspect))
+                yield np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))

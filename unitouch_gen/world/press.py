@@ -19,11 +19,14 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     check_choice,
+    check_count,
     check_file,
+    check_finite,
     check_integer,
+    check_not_empty,
     check_number,
     describe,
-    first_line,
+    explain_errors,
 )
 from unitouch_gen.world.draws import generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_square, in_view, indentation_against
@@ -96,8 +99,7 @@ def press(
     places = [_place(value, mm, maps[0]) for value in _listed("at", at)]
     count = max(len(maps), len(depths), len(places))
     for name, values in {"height": len(maps), "depth": len(depths), "at": len(places)}.items():
-        if values not in (1, count):
-            raise InvalidInputError(f"`{name}` has {values} values for {count} contacts; pass one, or as many.")
+        check_count(name, values, count)
 
     # 2. The square of surface under each contact.
     pixels, extent = gel_square(sensor, size)
@@ -128,8 +130,7 @@ def _listed(name: str, values: Any) -> list[Any]:
     if hasattr(values, "tolist"):
         values = values.tolist()
     listed = list(values) if isinstance(values, list | tuple) else [values]
-    if not listed:
-        raise InvalidInputError(f"`{name}` is empty; pass one value, or one for each contact.")
+    check_not_empty(name, listed)
     return listed
 
 
@@ -139,13 +140,10 @@ def _place(place: Any, mm: float, height: Tensor) -> tuple[float, float]:
         wanted = "pass pairs of x and y in mm from the centre, such as [(5, -3)]"
         raise InvalidInputError(f"`at` holds {describe(place)}; {wanted}.")
     rows, columns = height.shape
-    x = check_number("at", place[0])
-    y = check_number("at", place[1])
     half_width = 0.5 * mm
     half_height = 0.5 * mm * rows / columns
-    if abs(x) > half_width or abs(y) > half_height:
-        most = f"{half_width:g} mm to a side and {half_height:g} mm up and down"
-        raise InvalidInputError(f"`at` is ({x:g}, {y:g}), outside the map, which reaches {most} from its centre.")
+    x = check_number("at", place[0], -half_width, half_width)  # beyond them there is no map
+    y = check_number("at", place[1], -half_height, half_height)
     return x, y
 
 
@@ -190,8 +188,7 @@ def height_maps(height: Any, relief_mm: float, name: str = "height") -> list[Ten
     """Height maps of all kinds as float32 (H, W) in mm, each relative to its middle height, all of one shape."""
     maps = list[Tensor]()
     if isinstance(height, list | tuple):
-        if not height:
-            raise InvalidInputError(f"`{name}` is an empty list; pass at least one height map.")
+        check_not_empty(name, height)
         for row, item in enumerate(height):
             item_name = f"{name}[{row}]"
             maps.append(_checked(item_name, _values(item_name, item), relief_mm))
@@ -212,14 +209,8 @@ def _values(name: str, height: Any) -> np.ndarray:
     subject = f"`{name}`"
     if isinstance(height, str | os.PathLike):
         check_file(name, height, "a height map")
-        content = Path(height).read_bytes()
-        if content.startswith(b"\x93NUMPY"):
-            try:
-                return np.load(io.BytesIO(content), allow_pickle=False)
-            except ValueError as error:
-                raise InvalidInputError(f"`{name}` names {str(height)!r}: {first_line(error)}.") from error
         subject = f"`{name}` names {str(height)!r}, which"
-        height = _opened(subject, io.BytesIO(content))
+        height = _read(subject, Path(height).read_bytes())
     if isinstance(height, Image.Image):
         return _grey(subject, height)
     if isinstance(height, Tensor):
@@ -229,20 +220,18 @@ def _values(name: str, height: Any) -> np.ndarray:
     raise InvalidTypeError(f"`{name}` is {describe(height)}; pass a path, or an array of heights (H, W).")
 
 
-def _opened(subject: str, content: io.BytesIO) -> Image.Image:
-    """An image whose size is checked before its pixels are decoded."""
+def _read(subject: str, content: bytes) -> Image.Image | np.ndarray:
+    """The image or array in a file. The size of an image is checked before its pixels are decoded."""
     wanted = "save it as a PNG of 8 or 16 bits, a float TIFF or a .npy file"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(content)
-            _check_size(subject, *image.size)
-            image.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        if isinstance(error, InvalidInputError):
-            raise
-        raise InvalidInputError(f"{subject} cannot be read as an image ({first_line(error)}); {wanted}.") from error
-    return image
+    kinds = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+    with explain_errors(f"{subject} cannot be read as an image", wanted, *kinds), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        if content.startswith(b"\x93NUMPY"):
+            return np.load(io.BytesIO(content), allow_pickle=False)
+        image = Image.open(io.BytesIO(content))
+        _check_size(subject, *image.size)
+        image.load()
+        return image
 
 
 def _check_size(subject: str, width: int, height: int) -> None:
@@ -283,12 +272,7 @@ def _checked(name: str, values: np.ndarray, relief_mm: float) -> Tensor:
     else:
         wanted = "pass floats in mm, or uint8 or uint16 as shares of `relief_mm`"
         raise InvalidTypeError(f"`{name}` is {describe(values)}; {wanted}.")
-    not_finite = int((~np.isfinite(heights)).sum())
-    if not_finite:
-        raise InvalidInputError(
-            f"`{name}` holds {not_finite} of {heights.size} values that are NaN or infinite; fill them."
-        )
-    heights = relief_mm * heights
+    heights = relief_mm * check_finite(name, torch.from_numpy(heights)).numpy()
     low = heights.min()
     high = heights.max()
     if not FLATTEST < high - low < 1e5:
