@@ -162,6 +162,29 @@ def test_training_runs_as_a_module(monkeypatch, capsys):
     assert all(f" {stage} " in helped for stage in STAGES)
 
 
+WATCHED = """
+import os, runpy, sys
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            print("torch is imported with", os.environ.get("OMP_WAIT_POLICY"))
+
+sys.meta_path.insert(0, Watch())
+sys.argv = ["training", "touch", "--help"]
+runpy.run_module("unitouch_gen.training", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(("own", "policy"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_threads_of_training_wait_passively_unless_the_user_said_otherwise(own, policy, tmp_path, monkeypatch):
+    """OpenMP reads the variable when torch is imported."""
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", own)
+    assert run(["-c", WATCHED], tmp_path).splitlines()[0] == f"torch is imported with {policy}"
+
+
 def test_built_in_pipelines_run():
     touch, photo = unitouch_gen.example("brick"), unitouch_gen.example("wood", "image")
     for name, inputs in {

@@ -10,6 +10,7 @@ from typing import Annotated
 
 from typer import Option, echo
 
+from unitouch_gen.errors import interrupt_on_termination
 from unitouch_gen.training.checkpoints import checkpoints_in
 
 
@@ -128,6 +129,8 @@ def train_family(
     A stage that left its record is done. To train one anew, remove its folder, and those of the stages that take its
     model.
     """
+    if not dry_run:
+        interrupt_on_termination()  # an interrupt ends the running stage, too
     for run in RUNS:
         if (runs / run.name / "record.json").is_file():
             continue

@@ -8,7 +8,9 @@ import logging
 import math
 import os
 import re
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
@@ -79,6 +81,27 @@ def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **opti
         if message:  # empty if the help was shown
             say(message)
     sys.exit(2)
+
+
+def wait_passively() -> None:
+    """Lets threads that wait for each other leave the processors to other processes, unless the user said otherwise.
+
+    It has no effect once torch is imported.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def interrupt_on_termination() -> None:
+    """Makes SIGTERM and SIGHUP interrupt the process as Ctrl-C does, so that temporary folders are removed.
+
+    It has no effect outside of the main thread.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for name in ("SIGTERM", "SIGHUP"):  # sent by `docker stop`, systemd and Slurm, and by a terminal that closes
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
+            signal.signal(number, signal.default_int_handler)
 
 
 def check_working_folder() -> None:

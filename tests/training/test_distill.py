@@ -21,8 +21,8 @@ from tests.helpers.small_family import write_small_family
 from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import InvalidInputError, run_commands
-from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.checkpoints import checkpoints_in
+from unitouch_gen.training.commands import app
 from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers, teacher_objective
 from unitouch_gen.training.recipe import read_recipe
 

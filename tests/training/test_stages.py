@@ -19,8 +19,8 @@ from tests.helpers.components import AUDIO, SPACE
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.training.__main__ import app
 from unitouch_gen.training.checkpoints import checkpoints_in
+from unitouch_gen.training.commands import app
 from unitouch_gen.training.family import FINAL_RUNS, RUNS, STAGES
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import Stage, weights_of

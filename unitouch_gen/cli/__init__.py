@@ -1,9 +1,6 @@
 """`unitouch-gen`: commands, a thin layer over the pipelines. Each command imports its dependencies when it runs."""
 
-import os
-import signal
 import sys
-from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -20,7 +17,7 @@ from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.numerics import stability, work_precision
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.press import press
-from unitouch_gen.errors import run_commands
+from unitouch_gen.errors import interrupt_on_termination, run_commands, wait_passively
 
 commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -50,16 +47,6 @@ commands.add_typer(data, name="data")
 
 def main() -> None:
     """Entry point. A user's mistake ends in one line and exit code 2."""
-    # Before torch is imported: threads that wait for each other leave the processors to other processes.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with suppress(ValueError):  # raised outside of the main thread
-        interrupt_on_termination()
+    wait_passively()
+    interrupt_on_termination()
     sys.exit(run_commands(commands, "unitouch-gen"))
-
-
-def interrupt_on_termination() -> None:
-    """Makes SIGTERM and SIGHUP interrupt the process as Ctrl-C does, so that temporary folders are removed."""
-    for name in ("SIGTERM", "SIGHUP"):  # sent by `docker stop`, systemd and Slurm, and by a terminal that closes
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # `nohup` ignores it
-            signal.signal(number, signal.default_int_handler)
