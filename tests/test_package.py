@@ -145,6 +145,26 @@ def test_a_clone_imports_as_it_lies():
     assert found == CHECKOUT / "unitouch_gen" / "pipelines" / "__init__.py"
 
 
+TWICE = """
+import pipelines.base, training.stages
+from pipelines import TouchToImagePipeline
+from pipelines.touch_to_image import TouchToImagePipeline as of_its_module
+from training.data import Contacts
+from unitouch_gen.pipelines.base import UniTouchPipeline
+import unitouch_gen.training.data, unitouch_gen.training.stages
+
+assert pipelines.base.UniTouchPipeline is UniTouchPipeline
+assert TouchToImagePipeline is of_its_module and issubclass(of_its_module, UniTouchPipeline)
+assert training.stages.Stage is unitouch_gen.training.stages.Stage
+assert Contacts is unitouch_gen.training.data.Contacts
+"""
+
+
+@pytest.mark.skipif(not (CHECKOUT / "pipelines").is_dir(), reason="there is no checkout here")
+def test_folders_imported_by_their_own_names_make_no_class_twice():
+    run(["-c", TWICE], CHECKOUT)
+
+
 def test_the_command_line_answers(tmp_path):
     assert "touch-to-image" in run([str(Path(sys.executable).with_name("unitouch-gen")), "--help"], tmp_path)
 
