@@ -47,7 +47,7 @@ from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_sav
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, normalise_pixels
 from unitouch_gen.models.joint import UNTOUCHED, warn_of_unknown
-from unitouch_gen.models.sensors import SensorMatch
+from unitouch_gen.models.sensor_bank import SensorMatch
 from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.pipelines.hub import CARD, RECORD, Card, name_classes, resolve_classes
 from unitouch_gen.sampling import (

@@ -18,7 +18,7 @@ from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.joint import Gaussians, RelativeDistance, touch_statistics
-from unitouch_gen.models.sensors import layout_distances
+from unitouch_gen.models.sensor_bank import layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
 from unitouch_gen.training.data import Contacts, sensor_numbers

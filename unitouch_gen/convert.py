@@ -25,7 +25,7 @@ from unitouch_gen.files import as_path, check_writable
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
-from unitouch_gen.models.sensors import SensorBank
+from unitouch_gen.models.sensor_bank import SensorBank
 from unitouch_gen.saving import filling
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}

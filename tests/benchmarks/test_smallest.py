@@ -23,7 +23,7 @@ from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.training.data import DataConfig
 from unitouch_gen.training.trainer import TrainerConfig
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
-from unitouch_gen.world.scene import MODALITIES
+from unitouch_gen.world.scene import SCENE_MODALITIES
 
 pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
 
@@ -77,11 +77,11 @@ class Elements(TorchDispatchMode):
 
 def test_each_request_does_less_than_everything() -> None:
     index, counts = torch.arange(2), {}
-    for names in (MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
+    for names in (SCENE_MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
         with Elements() as elements:
             World().render(index, 0 * index, 0 * index, modalities=names, sensors=tuple(SENSORS))
         counts[names] = elements.count
-    everything = counts.pop(MODALITIES)
+    everything = counts.pop(SCENE_MODALITIES)
     assert max(counts.values()) < 0.9 * everything and counts["text",] < 0.01 * everything
 
 

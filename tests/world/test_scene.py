@@ -8,14 +8,14 @@ import torch
 
 from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.world import MATERIAL_NAMES, MODALITIES, SENSORS, Scene, World, draw_sensor
+from unitouch_gen.world import MATERIAL_NAMES, SCENE_MODALITIES, SENSORS, Scene, World, draw_sensor
 from unitouch_gen.world.scene import YIELD, grasp_margin
 from unitouch_gen.world.surfaces import surfaces
 
 MATERIAL = torch.arange(17).repeat_interleave(4)
 NAMES = MATERIAL, torch.tensor([0, 3, 500, 800]).repeat(17), torch.arange(68) % 3
 USED = ("gelsight", "digit", draw_sensor(0, 2))
-EVERY = {"modalities": MODALITIES, "sensors": USED}
+EVERY = {"modalities": SCENE_MODALITIES, "sensors": USED}
 
 
 def small(seed: int = 0) -> World:
@@ -53,13 +53,13 @@ def test_a_scene_is_its_names_and_its_seed(gallery: Scene) -> None:
     assert not close(small(7).render(*few, **EVERY), gallery, slice(3))
 
 
-@pytest.mark.parametrize("modality", MODALITIES)
+@pytest.mark.parametrize("modality", SCENE_MODALITIES)
 def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, modality: str) -> None:
     made = small().render(*(part[:5] for part in NAMES), modalities=(modality,), sensors=USED[:2])
-    present = {name for name in MODALITIES if getattr(made, name) not in (None, {})}
+    present = {name for name in SCENE_MODALITIES if getattr(made, name) not in (None, {})}
     assert present == {modality}
     surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": []}
-    others = [name for name in MODALITIES if name != modality]
+    others = [name for name in SCENE_MODALITIES if name != modality]
     assert made.left_out == others + surfaces.get(modality, ["colours of surfaces"])
     found, expected = getattr(made, modality), getattr(gallery, modality)
     for name, values in found.items() if isinstance(found, dict) else ():

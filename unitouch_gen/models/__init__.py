@@ -9,7 +9,7 @@ from unitouch_gen.models.config import UniTouchConfig, UniTouchViTConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.models.sensor_bank import SensorBank, SensorMatch
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT
 
 AutoConfig.register(UniTouchConfig.model_type, UniTouchConfig, exist_ok=True)

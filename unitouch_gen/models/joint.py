@@ -27,7 +27,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import LOADING_OPTIONS, local_folder, read_settings, reading
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, local_mean
-from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
+from unitouch_gen.models.sensor_bank import SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 from unitouch_gen.saving import saved_whole
 

@@ -5,7 +5,7 @@ from unitouch_gen.world.draws import FIRST_OBJECT
 from unitouch_gen.world.gel import untouched_gel
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, Material
 from unitouch_gen.world.press import Pressed, press
-from unitouch_gen.world.scene import MODALITIES, Scene, World
+from unitouch_gen.world.scene import SCENE_MODALITIES, Scene, World
 from unitouch_gen.world.sensors import SENSORS, Sensor, draw_sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 
@@ -17,8 +17,8 @@ __all__ = [
     "MAPS",
     "MATERIALS",
     "MATERIAL_NAMES",
-    "MODALITIES",
     "SAMPLE_RATE",
+    "SCENE_MODALITIES",
     "SENSORS",
     "Material",
     "Pressed",

@@ -32,7 +32,7 @@ from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
 from unitouch_gen.world.surfaces import Surfaces, pictures, surfaces
 
-MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
+SCENE_MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
 
 YIELD = 0.75  # share of an overlap by which an object as compliant as the gel is flattened
 
@@ -123,7 +123,9 @@ class World:
             InvalidInputError: If a modality, sensor or material is unknown, or names are not (N,), or not as many.
         """
         # 1. Check, and draw the numbers of the contacts.
-        requested = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
+        requested = {
+            check_choice("modalities", name, SCENE_MODALITIES) for name in check_texts("modalities", modalities)
+        }
         sensor_list = _sensors(sensors)
         material = _numbers("material", material, most=len(MATERIALS) - 1)
         object = _numbers("object", object, len(material))
@@ -131,7 +133,7 @@ class World:
         draws = self.draw(material, object, contact)
         scan_names = [scanned_surfaces()[number].name if number >= 0 else None for number in draws.surface.tolist()]
         scene = Scene(material, object, contact, surface=scan_names)
-        scene.left_out = [name for name in MODALITIES if name not in requested]
+        scene.left_out = [name for name in SCENE_MODALITIES if name not in requested]
 
         # 2. Surfaces, their pictures, and gels.
         coloured = "image" in requested
