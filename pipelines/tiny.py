@@ -109,8 +109,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 def distilled(pipe: Any, folder: Path) -> Any:
     """A copy of a pipeline with LoRA weights of `unitouch-gen distill` fused into its UNet, and their defaults."""
     needed("peft")
-    if not folder.is_dir():
-        raise InvalidInputError(f"{str(folder)!r} is no folder of LoRA weights; make them by `unitouch-gen distill`.")
+    defaults = read_settings("lora", folder / "defaults.json")
     student = copy.copy(pipe)
     unet = copy.deepcopy(pipe.unet)
     # As `pipe.load_lora_weights` does, which would look for weights of the text encoder, too.
@@ -121,7 +120,7 @@ def distilled(pipe: Any, folder: Path) -> Any:
     unet.unload_lora()
     student.unet = unet
     student.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
-    student.register_to_config(**read_settings("folder", folder / "defaults.json"))
+    student.register_to_config(**defaults)
     return student
 
 

@@ -63,12 +63,11 @@ _MODULES = ("errors", "examples", "models", "pipelines.tiny", "pipelines")  # th
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    for module_name in _MODULES:
-        module = import_module(f"{__name__}.{module_name}")
-        if hasattr(module, name):
-            return getattr(module, name)
+    if name in __all__:
+        for module_name in _MODULES:
+            module = import_module(f"{__name__}.{module_name}")
+            if hasattr(module, name):
+                return getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -20,7 +20,16 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_file, check_finite, check_kind, first_line
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_dtype,
+    check_file,
+    check_finite,
+    check_kind,
+    check_passed,
+    check_unused,
+    first_line,
+)
 from unitouch_gen.files import as_path, check_writable
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
@@ -115,13 +124,11 @@ def published_name(modality: str, key: str) -> tuple[str, Rule]:
 
 
 def _read_published(
-    files: Mapping[str, str | os.PathLike | None], config: UniTouchConfig, dtype: torch.dtype | None
+    files: Mapping[str, str | os.PathLike], config: UniTouchConfig, dtype: torch.dtype | None
 ) -> UniTouchModel:
     """A joint space from the published `FILES`, by the names of arguments of `convert_published`."""
     model: Any = UniTouchModel(config, modalities=()).eval()
     for name, file in files.items():
-        if file is None:
-            continue
         model.source = as_path(name, file)
         checkpoint = open_checkpoint(name, model.source)
         published = {key.removeprefix("model."): tensor for key, tensor in checkpoint.items()}
@@ -256,16 +263,14 @@ def convert_published(
     """
     output = as_path("output", output)
     config = check_kind("config", UniTouchConfig() if config is None else copy.deepcopy(config), UniTouchConfig)
-    if touch is None and imagebind is None:
-        raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
-    if config.sensors:
-        raise InvalidInputError("`config` names sensors, but published files hold no sensor tokens; leave them out.")
+    files = check_passed({"imagebind": imagebind, "touch": touch})
+    check_unused("on published files, which hold no sensor tokens", **{"config.sensors": config.sensors or None})
     weights_dtype = None if dtype is None else check_dtype("dtype", dtype)
     text_tokenizer = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
     if any((output / file).exists() for file in ("model_index.json", "config.json")):
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds a model; name another folder.")
     check_writable("output", output / "config.json")
-    model = _read_published({"imagebind": imagebind, "touch": touch}, config, weights_dtype)
+    model = _read_published(files, config, weights_dtype)
     missing = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.known_modalities]
     if "touch" in model.known_modalities:
         missing.append("sensor tokens, which were not published")

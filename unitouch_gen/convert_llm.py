@@ -13,7 +13,7 @@ from torch import Tensor
 from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM
 
 from unitouch_gen.convert import open_checkpoint
-from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_file
 from unitouch_gen.files import local_folder, reading
 from unitouch_gen.models.language import LanguageBridge
 from unitouch_gen.models.processing import read_tokenizer
@@ -53,8 +53,7 @@ def read_touch_llm(
     """
     dtype = check_dtype("dtype", dtype)
     folder = local_folder("llama", llama)
-    if not (folder / "config.json").is_file():
-        raise InvalidInputError(f"`llama` is {str(folder)!r}, which has no config.json; pass transformers' layout.")
+    check_file("llama", folder / "config.json", "a folder in transformers' layout")
     tokenizer = read_tokenizer("llama", folder, AutoTokenizer)
     tensors = open_checkpoint("bridge", bridge)
     model: Any

@@ -314,8 +314,8 @@ def check_passed(arguments: Mapping[str, Any], *, only_one: bool = False) -> dic
     passed = {name: value for name, value in arguments.items() if value is not None}
     if not passed or (only_one and len(passed) > 1):
         names = ", ".join(f"`{name}`" for name in arguments)
-        have = " and ".join(f"`{name}`" for name in passed) or "None"
-        raise InvalidInputError(f"{have} of {names} was passed; pass {'exactly' if only_one else 'at least'} one.")
+        wanted = "exactly" if only_one else "at least"
+        raise InvalidInputError(f"Pass {wanted} one of {names}, not {len(passed)} of them.")
     return passed
 
 

@@ -171,8 +171,8 @@ def finish_save(folder: Path) -> None:
     file = folder / UNFINISHED
     with explain_errors(f"`{file}` is no plan of a save", "save again", ValueError, TypeError, LookupError):
         plan = json.loads(file.read_text())
-        moves = [(path_inside(folder, hidden), path_inside(folder, place)) for hidden, place in plan["moves"]]
-        removed = [path_inside(folder, name) for name in plan["removed"]]
+        moves = [[path_inside(str(file), folder, place) for place in move] for move in plan["moves"]]
+        removed = [path_inside(str(file), folder, place) for place in plan["removed"]]
     for hidden, destination in moves:
         if os.path.lexists(hidden):  # it has not been moved yet
             os.replace(hidden, destination)
@@ -184,11 +184,11 @@ def finish_save(folder: Path) -> None:
     file.unlink()
 
 
-def path_inside(folder: Path, name: str) -> Path:
-    """A path below a folder, by its name there; raises for a name that leads out of the folder."""
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InvalidInputError(f"{name!r} leads out of `{folder}`; name a place in it.")
-    return folder / name
+def path_inside(name: str, folder: Path, place: str) -> Path:
+    """A path below a folder, by its place there, which the argument `name` holds; raises if that leads out of it."""
+    if Path(place).is_absolute() or ".." in Path(place).parts:
+        raise InvalidInputError(f"`{name}` is {place!r}, which leads out of {str(folder)!r}; name a place in it.")
+    return folder / place
 
 
 # Reading --------------------------------------------------------------------------------------------------------------

@@ -162,9 +162,7 @@ def prepare_scheduler(scheduler: Any, steps: int | list[int], init_strength: flo
     options: dict[str, Any] = {argument: steps, "device": device}
     parameters = inspect.signature(scheduler.set_timesteps).parameters
     if argument not in parameters:
-        raise InvalidInputError(
-            f"`{argument}` is {steps}, but {kind} chooses its own; pass `num_inference_steps` instead."
-        )
+        check_unused(f"with {kind}, which chooses its own", **{argument: steps})
     problem = f"`{argument}` is {steps}, which {kind} cannot run"
     with explain_errors(problem, "take other steps, or name a `solver`", ValueError, IndexError, ZeroDivisionError):
         if "strength" in parameters:  # of LCM and TCD

@@ -61,13 +61,13 @@ BAD = {
         ("app --model in", "`--model` names 'in/model_index.json'"),
     ],
     "combinations": [
-        (TO_TOUCH, "No input was given"),
-        (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` was given 2 times, another 3"),
+        (TO_TOUCH, "Pass at least one of `--image`, `--text`"),
+        (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` holds 2 for 3 inputs"),
         (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
-        ("convert unitouch -o out", "Pass `touch`, `imagebind` or both"),
+        ("convert unitouch -o out", "Pass at least one of `imagebind`, `touch`"),
     ],
     "outputs": [
-        ("touch-to-image in/dark.png -o in", "`--output` is 'in', where an input would be replaced"),
+        ("touch-to-image in/dark.png -o in", "`--output` would replace 'in/dark.png'"),
         ("touch-to-image in/dark.png -o in/bright.png", "`--output` would replace 'in/bright.png'"),
         ("touch-to-image in -o out.png", "'out.png' for 2 pictures"),
         ("touch-to-image in/dark.png -o out.xbm", "`--output` is 'out.xbm'"),

@@ -100,7 +100,7 @@ def test_lists_that_say_something_else_are_refused(here, run, refused, files):
         ("touch,seed\nin/dark.png,1.5\n", [], "`seed` is 1.5"),
         ("touch,seed\nin/dark.png,nan\n", [], "`seed` is 'nan'"),
         (f"touch,seed\nin/dark.png,{2**64}\n", [], f"`seed` is {2**64}"),
-        ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
+        ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up.png'"),
         ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`--set` is 'bogus'"),
         ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),
     ):

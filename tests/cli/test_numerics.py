@@ -70,8 +70,11 @@ def test_bad_input_exits_with_2_and_one_line(here, command, refused, table, file
         ("stability --only fin", "`--only` is 'fin'"),
         ("stability --only", "requires an argument"),
         ("stability --model other", "holds a StableDiffusionPipeline; name a saved TouchToImagePipeline"),
-        ("work-precision -o out", "Pass `--problem` or `--pipeline`"),
-        ("work-precision -o out --problem mixture-7.5 --model in", "not of an exact problem"),
+        ("work-precision -o out", "Pass exactly one of `--problem`, `--pipeline`"),
+        (
+            "work-precision -o out --problem mixture-7.5 --model in",
+            "`--model` is 'in', but has no effect with `--problem`",
+        ),
         ("work-precision -o out --problem mixture-7", "`--problem` is 'mixture-7'"),
         ("work-precision -o out --problem mixture-7.5 --solvers eulr", "Did you mean 'euler'?"),
         ("work-precision -o out --problem mixture-7.5 --steps 5,x", "`--steps` is 'x'"),

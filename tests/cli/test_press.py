@@ -51,11 +51,14 @@ def test_bad_calls_are_one_line_and_write_nothing(command, refused, files, here)
         (("example:coin", "--mm", "wide", "-o", "out"), "--mm"),
         (("example:coin", "--depth", "nan", "-o", "out"), "`depth` is nan"),
         (("example:coin", "--sensor", "digt", "-o", "out"), "`--sensor` is 'digt'", "Did you mean 'digit'?"),
-        (("example:coin", "--at", "3", "-o", "out"), "`--at` is '3'; pass X,Y"),
-        (("example:coin", "--mm", "24", "--at", "40,0", "-o", "out"), "outside the map"),
+        (("example:coin", "--at", "3", "-o", "out"), "`--at` is '3'", "pass X,Y"),
+        (
+            ("example:coin", "--mm", "24", "--at", "40,0", "-o", "out"),
+            "`at` is 40.0; it has to be a number from -12 to 12",
+        ),
         (("example:coin", "--sensor", "all", "-o", "out.png"), "'out.png' for 4 pictures"),
         (("example:coin", "-o", "flat.png"), "`--output` would replace 'flat.png'"),
-        (("flat.png", "--overwrite", "-o", "flat.png"), "a map would be replaced"),
+        (("flat.png", "--overwrite", "-o", "flat.png"), "would replace 'flat.png'"),
     ):
         refused(command("press", *words), *said)
         assert files(here) == before, words

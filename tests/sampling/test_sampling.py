@@ -51,7 +51,7 @@ def test_steps_that_cannot_be_made_are_refused():
         ({"timesteps": [500, 999]}, "`timesteps` is .*; each has to be below the one before"),
         ({"timesteps": [1000, 1]}, "`timesteps` is 1000"),
         ({"timesteps": 5}, "`timesteps` is"),
-        ({"timesteps": [999, 9]}, "DDIMScheduler chooses its own"),
+        ({"timesteps": [999, 9]}, "DDIMScheduler, which chooses its own"),
         ({"timesteps": [99, 9], "scheduler": diffusers.DDPMScheduler()}, "99, 9], .* starts at timestep 99 of 1000"),
         ({"init_strength": 0.5, "scheduler": diffusers.FlowMatchEulerDiscreteScheduler()}, "starts at noise alone"),
         (

@@ -11,7 +11,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import folder_of, kind_of, load_pipeline
-from unitouch_gen.errors import InvalidInputError, needed
+from unitouch_gen.errors import InvalidInputError, explain_errors, needed
 
 
 def app(
@@ -59,10 +59,9 @@ def check_address(host: str, port: int) -> None:
     """Raises if the port is taken or the host is none of this machine's addresses, before anything is loaded."""
     for name in (host, "127.0.0.1"):  # gradio opens the port at the latter, too
         family = socket.AF_INET6 if ":" in name else socket.AF_INET
-        try:
+        problem = f"`--port` {port} cannot be served at {name!r}"
+        with explain_errors(problem, "name another", OSError, UnicodeError):
             socket.create_server((name, port), family=family).close()
-        except (OSError, UnicodeError) as error:
-            raise InvalidInputError(f"`--port` {port} cannot be served at {name!r}: {error}; name another.") from error
 
 
 def isolate_gradio(uploads: str) -> None:

@@ -14,7 +14,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import DRAWING, IMAGES, files_in, load_pipeline, suffixes_of
 from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
 from unitouch_gen.errors import InvalidInputError, check_choice, check_file, check_integer, first_line
-from unitouch_gen.files import files_below, find_file, read_table, write_file
+from unitouch_gen.files import files_below, find_file, path_inside, read_table, write_file
 
 FILES = ("touch", "image", "audio", "background")
 COLUMNS = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
@@ -163,17 +163,16 @@ def pictures_of(rows: Sequence[dict[str, str]], kind: Any, source: Path, output:
         for column in FILES:
             if column in inputs:
                 inputs[column] = str(find_file(folder, inputs[column]))
-        pictures.append(Picture(inputs, output / f"{name}.png", seed_of(row.get("seed", str(seed)))))
+        pictures.append(
+            Picture(inputs, path_inside("name", output, f"{name}.png"), seed_of(row.get("seed", str(seed))))
+        )
     return pictures
 
 
 def name_of(row: dict[str, str]) -> str:
     """The name of a row's picture, or the stem of its first file, or the first words of its text."""
     stems = [stem_of(Path(row[column])) for column in FILES if column in row]
-    name = row.get("name") or (stems[0] if stems else stem_of(row.get("text", "")))
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InvalidInputError(f"`name` is {name!r}, a place elsewhere; name one in the output.")
-    return name
+    return row.get("name") or (stems[0] if stems else stem_of(row.get("text", "")))
 
 
 def seed_of(cell: str) -> int:

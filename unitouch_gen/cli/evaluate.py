@@ -13,7 +13,7 @@ from typer import Argument, Option, echo
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_choice, check_number
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number, check_unused
 from unitouch_gen.files import write_file
 
 TABLES = {
@@ -61,8 +61,8 @@ def evaluate(
     shares = {"scanned": scanned, "recordings": recordings}
     for name, share in shares.items():
         check_number(f"--{name}", share, 0.0, 1.0)
-        if share and data:
-            raise InvalidInputError(f"`--{name}` is of the world's contacts; leave it out, or `--data`.")
+        if data:
+            check_unused("with `--data`", **{f"--{name}": share or None})
     if model is not None and table in PIPELINES:
         kind_of(model, [PIPELINES[table]])
     from unitouch_gen.training.data import open_dataset

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.cli.options import note
-from unitouch_gen.errors import InvalidInputError, check_arguments, check_dtype, check_file
+from unitouch_gen.errors import InvalidInputError, check_arguments, check_dtype, check_file, explain_errors
 from unitouch_gen.examples import example
 from unitouch_gen.files import (
     class_name,
@@ -176,8 +176,7 @@ def device_of(name: str) -> Any:
 
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
+    kinds = (RuntimeError, AssertionError, NotImplementedError)
+    with explain_errors(f"`--device` is {name!r}, which cannot be used here", "pass cpu or cuda", *kinds):
         torch.empty(1, device=name).cpu()  # raises for meta, a device without data
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise InvalidInputError(f"`--device` is {name!r}, which cannot be used here; pass cpu or cuda.") from error
     return torch.device(name)

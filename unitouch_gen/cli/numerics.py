@@ -10,7 +10,7 @@ from typer import Exit, Option, echo
 
 from unitouch_gen.cli.loading import DRAWING, kind_of, load_pipeline
 from unitouch_gen.cli.options import Guidance, Model, by_comma, check_output, print_table, value_of
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.errors import check_choice, check_integer, check_number, check_passed, check_unused
 from unitouch_gen.files import reading
 from unitouch_gen.weights import FAMILY
 
@@ -39,10 +39,9 @@ def work_precision(
     from unitouch_gen.numerics.problems import PROBLEMS
     from unitouch_gen.pipelines.tiny import distilled
 
-    if (problem is None) == (pipeline is None):
-        raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
-    if problem is not None and (model, lora, guidance_scale) != (None, None, None):
-        raise InvalidInputError("`--model`, `--lora` and `--guidance` are of pipelines, not of an exact problem.")
+    check_passed({"--problem": problem, "--pipeline": pipeline}, only_one=True)
+    if problem is not None:
+        check_unused("with `--problem`", **{"--model": model, "--lora": lora, "--guidance-scale": guidance_scale})
     check_output([output / "results.json"], overwrite=True)
     built_in = FAMILY / str(pipeline) / "turbo"
     if lora is None and model is None and built_in.is_dir() and find_spec("peft"):

@@ -4,7 +4,7 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -95,13 +95,24 @@ def by_comma(words: str | None) -> list[str] | None:
     return None if words is None else [word.strip() for word in words.split(",")]
 
 
-def check_output(files: Sequence[Path], overwrite: bool) -> None:
-    """Raises if files would be replaced without `overwrite`, or cannot be written."""
+def targets_of(output: Path, stems: Sequence[str]) -> list[Path]:
+    """A file for each name in a folder, or the one file that `output` names."""
+    if not output.suffix or os.path.isdir(output):
+        return [output / f"{stem}.png" for stem in stems]
+    if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(stems) > 1:
+        wanted = "name a folder, or for one a .png, .jpg or .webp"
+        raise InvalidInputError(f"`--output` is {str(output)!r} for {len(stems)} pictures; {wanted}.")
+    return [output]
+
+
+def check_output(files: Sequence[Path], overwrite: bool, inputs: Iterable[Path] = ()) -> None:
+    """Raises if files would replace inputs, or others without `overwrite`, or cannot be written."""
+    input_files = {os.path.realpath(file) for file in inputs}
     for file in files:
-        if not overwrite and os.path.lexists(file):
-            raise InvalidInputError(
-                f"`--output` would replace {str(file)!r}; name another place, or pass `--overwrite`."
-            )
+        is_input = os.path.realpath(file) in input_files
+        if is_input or (not overwrite and os.path.lexists(file)):
+            wanted = "name another place" if is_input else "name another place, or pass `--overwrite`"
+            raise InvalidInputError(f"`--output` would replace {str(file)!r}; {wanted}.")
     check_writable("--output", files[0])
 
 

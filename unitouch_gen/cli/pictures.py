@@ -4,7 +4,6 @@ Inputs are checked before a network runs and before a folder is made.
 """
 
 import json
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typer import Argument, Context, Option, echo
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import files_of, load_pipeline
 from unitouch_gen.cli.options import SEVERAL
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_count, check_passed
 from unitouch_gen.files import replacing
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -133,16 +132,15 @@ def x_to_touch(
 
     Example: unitouch-gen x-to-touch --text "rough brick" --sensor all -o touches/
     """
+    words_by_option = {"--image": image, "--text": text, "--audio": audio, "--touch": touch}
+    passed = check_passed({option: words or None for option, words in words_by_option.items()})
     inputs: dict[str, list[Any]] = {}
-    for name, words in {"image": image, "text": text, "audio": audio, "touch": touch}.items():
-        if words:
-            inputs[name] = words if name == "text" else files_of(f"--{name}", words, name)
-    if not inputs:
-        raise InvalidInputError("No input was given; pass `--image`, `--text`, `--audio` or `--touch`.")
+    for option, words in passed.items():
+        name = option.removeprefix("--")
+        inputs[name] = words if name == "text" else files_of(option, words, name)
     most = max(map(len, inputs.values()))
     for name, values in inputs.items():
-        if len(values) not in (1, most):
-            raise InvalidInputError(f"`--{name}` was given {len(values)} times, another {most}; pass one, or as many.")
+        check_count(f"--{name}", len(values), most)
     pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **options.model_options(context))
     sensors = sensor or ([] if background else pipe.config.sensors[:1])
     if "all" in sensors:
@@ -190,16 +188,9 @@ def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) ->
             all_inputs.append(inputs)
             seeds.append(params["seed"] + number)
             stems.append(f"{stem}-{number + 1}" if images > 1 else stem)
-    files = [output / f"{stem}.png" for stem in unique(stems)]
-    if output.suffix and not os.path.isdir(output):
-        if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(files) > 1:
-            wanted = "name a folder, or for one a .png, .jpg or .webp."
-            raise InvalidInputError(f"`--output` is {str(output)!r} for {len(files)} pictures; {wanted}")
-        files = [output]
-    input_files = {os.path.realpath(value) for inputs in all_inputs for value in inputs.values() if is_file(value)}
-    if input_files & {os.path.realpath(file) for file in files}:
-        raise InvalidInputError(f"`--output` is {str(output)!r}, where an input would be replaced; name another place.")
-    options.check_output(files, params["overwrite"])
+    files = options.targets_of(output, unique(stems))
+    input_files = [value for inputs in all_inputs for value in inputs.values() if is_file(value)]
+    options.check_output(files, params["overwrite"], inputs=input_files)
     return [Picture(inputs, file, seed) for inputs, file, seed in zip(all_inputs, files, seeds, strict=True)]
 
 

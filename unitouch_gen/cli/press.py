@@ -1,7 +1,6 @@
 """`unitouch-gen press`: touch images of height maps."""
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +10,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import files_of
 from unitouch_gen.cli.options import SEVERAL
 from unitouch_gen.cli.pictures import save, unique
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import check_choice, explain_errors
 from unitouch_gen.files import replacing
 
 MM_PER_LEVEL = 1e-4  # of depth maps; 65,535 levels reach 6.5 mm, more than the thickness of any gel
@@ -52,11 +51,9 @@ def press(
         for name in names:
             for number in range(1, len(places) + 1):
                 stems.append(f"{file.stem}-{name}-{number}" if len(places) > 1 else f"{file.stem}-{name}")
-    targets = targets_of(output, unique(stems))
+    targets = options.targets_of(output, unique(stems))
     maps = [target.with_name(f"{target.stem}-depth.png") for target in targets] if depth_maps else []
-    if {os.path.realpath(file) for file in files} & {os.path.realpath(file) for file in [*targets, *maps]}:
-        raise InvalidInputError(f"`--output` is {str(output)!r}, where a map would be replaced; name another place.")
-    options.check_output([*targets, *maps], overwrite)
+    options.check_output([*targets, *maps], overwrite, inputs=files)
 
     for file in files:  # checked first, so that the work does not end half done
         height_maps(file, check_relief(relief_mm), name=f"height {file.name}")
@@ -93,21 +90,9 @@ def press(
 
 def place_of(word: str) -> tuple[float, float]:
     """A place from the text of an option."""
-    try:
+    with explain_errors(f"`--at` is {word!r}", "pass X,Y in mm from the centre, such as 5,-3", ValueError):
         x, y = map(float, word.split(","))
-    except ValueError as error:
-        raise InvalidInputError(f"`--at` is {word!r}; pass X,Y in mm from the centre, such as 5,-3.") from error
     return x, y
-
-
-def targets_of(output: Path, stems: list[str]) -> list[Path]:
-    """A file for each name in a folder, or the one file that `output` names."""
-    if not output.suffix or os.path.isdir(output):
-        return [output / f"{stem}.png" for stem in stems]
-    if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp") or len(stems) > 1:
-        wanted = "name a folder, or for one a .png, .jpg or .webp."
-        raise InvalidInputError(f"`--output` is {str(output)!r} for {len(stems)} pictures; {wanted}")
-    return [output]
 
 
 def to_picture(touch: Any) -> Any:
