@@ -4,11 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from diffusers import StableUnCLIPImg2ImgPipeline
+from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from torch import Tensor, nn
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from tests.helpers.components import D
+from unitouch_gen.conditioning import SensorBackgrounds
+from unitouch_gen.pipelines import XToTouchPipeline
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -76,3 +78,15 @@ def diffusers_pipeline(components: dict[str, Any]) -> StableUnCLIPImg2ImgPipelin
     encoder = CLIPVisionModelWithProjection(config).eval()
     processor = CLIPImageProcessor(size=32, crop_size=32)
     return quiet(StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared))
+
+
+def shown_gels(
+    pipe: XToTouchPipeline, sensors: tuple[str, ...] = ("gelsight", "digit"), **parts: Any
+) -> XToTouchPipeline:
+    """A pipeline of the same parts whose network is shown untouched gels."""
+    torch.manual_seed(2)
+    labels = len(sensors) + 1 if sensors else None
+    unet = UNet2DConditionModel.from_config(pipe.unet.config, in_channels=6, num_class_embeds=labels).eval()
+    stored = SensorBackgrounds.of(torch.randn(len(sensors), 3, 8, 8)) if sensors else None
+    own = {**pipe.components, "unet": unet, "backgrounds": stored, **parts}
+    return quiet(XToTouchPipeline(**own, sensors=sensors, default_num_inference_steps=2))

@@ -1,19 +1,15 @@
 """The built-in family as pipelines: what it is made of, how it is read, steps to a tolerance, four evaluations."""
 
 import json
-import shutil
 
 import pytest
 import torch
 from diffusers import DDIMScheduler, LCMScheduler
-from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
 import unitouch_gen
 from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.small_family import write_small_family
-from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.pipelines.tiny import PIPELINES, TURBO
 
 
@@ -56,20 +52,10 @@ def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_pat
     assert "license: apache-2.0" in card and "class mean" in card and list((tmp_path / "pictures").iterdir())
 
 
-def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):
+def test_a_family_of_ones_own_is_read_in_the_dtype_asked_for(tmp_path):
     write_small_family(tmp_path)
     for name in PIPELINES:
         assert unitouch_gen.tiny(name, family=tmp_path, dtype="bfloat16").dtype is torch.bfloat16
-    file = tmp_path / weights.X_TO_TOUCH.name / "unet" / "diffusion_pytorch_model.safetensors"
-    save_file(dict(list(load_file(file).items())[1:]), file, metadata={"format": "pt"})
-    with pytest.raises(InvalidInputError, match="`family` "):
-        unitouch_gen.tiny("x-to-touch", family=tmp_path)
-    shutil.rmtree(file.parent)
-    families = [{"family": family} for family in (tmp_path, 3, "gone")]
-    families += [{"family": tmp_path, "name": name} for name in TURBO]  # without their LoRA weights
-    for wrong in (*families, {"name": "touch-to-imag"}, {"dtype": "int8"}):
-        with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(wrong))}` "):
-            unitouch_gen.tiny(**{"name": "x-to-touch", **wrong})
 
 
 def test_answers_name_what_was_touched_or_seen():

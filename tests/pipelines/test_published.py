@@ -11,7 +11,6 @@ from transformers import CLIPVisionModelWithProjection
 
 from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.published import converted, sizes, write_unclip
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline
 
@@ -83,24 +82,3 @@ def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, mo
     assert joint["token"] == "secret" and "revision" not in joint and unclip["revision"] == "v2"
     assert {"*.bin", "*.ckpt", "*.pth"} < set(joint["ignore_patterns"]) < set(unclip["ignore_patterns"])
     assert {"image_encoder/*", "*.fp16.*"} < set(unclip["ignore_patterns"])
-
-
-def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path):
-    places = {**parts, "narrow": converted(tmp_path, width=24, imagebind=False)}
-    for kind in ("pickled", "broken"):
-        places[kind] = shutil.copytree(parts["unclip"], tmp_path / kind)
-        file = places[kind] / "unet" / "diffusion_pytorch_model.safetensors"
-        torch.save({}, file.with_suffix(".bin"))
-        file.unlink() if kind == "pickled" else file.write_bytes(file.read_bytes()[:-500])
-    for unclip, joint, options, named in (
-        ("./gone", "joint", {}, "unclip"),
-        ("unclip", "../gone", {}, "unitouch"),
-        ("joint", "joint", {}, "unclip"),
-        ("unclip", "unclip", {}, "unitouch"),
-        ("pickled", "joint", {}, "unclip"),
-        ("broken", "joint", {}, "unclip"),
-        ("unclip", "narrow", {}, "unitouch"),
-        ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
-    ):
-        with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
-            to_image(places.get(unclip, unclip), places.get(joint, joint), **options)
