@@ -20,7 +20,6 @@ from unitouch_gen.errors import (
     check_not_empty,
     check_passed,
     check_tensor,
-    check_texts,
     check_unused,
 )
 from unitouch_gen.models.images import ImageInput, load_images
@@ -288,17 +287,13 @@ class XToTouchPipeline(UniTouchPipeline):
     def _encode(self, conditions: Conditions, arguments: SamplingArguments, report: RunReport) -> Tensor:
         """The mix of conditions, (B, 1, D), at the norm of the joint space's images."""
         model = self.unitouch
-        encoders = {
-            "image": model.get_image_features,
-            "text": model.get_text_features,
-            "audio": model.get_audio_features,
-        }
         mixed: Any = 0.0
         for modality, (weight, inputs) in conditions.items():
             if modality == "touch":
                 embeds = self._touch_embeds(inputs, report, arguments.throw)
             else:
-                embeds = self._match_norm(encoders[modality](**inputs), modality, arguments.throw)
+                features = model.get_features(modality, **inputs)
+                embeds = self._match_norm(features, modality, arguments.throw)
             if arguments.bridge and modality != "image":
                 embeds = self.embedding_bank.bridge(embeds)
             mixed = mixed + weight * embeds
@@ -324,19 +319,15 @@ class XToTouchPipeline(UniTouchPipeline):
             check_unused("without `touch`", source_sensor=source_sensor)
         inputs: dict[str, Any] = {}
         sizes: dict[str, int] = {}
-        if "image" in modalities:
-            inputs["image"] = {"pixel_values": self.processor.images(modalities["image"])}
-            sizes["image"] = len(inputs["image"]["pixel_values"])
-        if "text" in modalities:
-            check_texts("text", modalities["text"], blank=False)
-            inputs["text"] = self.processor.text(modalities["text"])
-            sizes["text"] = len(inputs["text"]["input_ids"])
-        if "audio" in modalities:
-            inputs["audio"] = {"input_values": self.processor.sounds(modalities["audio"], audible=True)}
-            sizes["audio"] = len(inputs["audio"]["input_values"])
-        if "touch" in modalities:
-            inputs["touch"] = self._read_touches(modalities["touch"], source_sensor)
-            sizes["touch"] = len(inputs["touch"].pixels)
+        for name in MODALITIES:
+            if name not in modalities:
+                continue
+            if name == "touch":
+                inputs[name] = self._read_touches(modalities[name], source_sensor)
+                sizes[name] = len(inputs[name].pixels)
+            else:
+                inputs[name] = self.processor.inputs(name, modalities[name])
+                sizes[name] = len(next(iter(inputs[name].values())))
         batch_size = max(sizes.values())
         for name, size in sizes.items():
             check_count(name, size, batch_size)

@@ -30,7 +30,7 @@ STAGES = {
     "texture": StageEntry(
         "Adds texture heads, on a network trained on photos, to the image and touch encoders.", {"joint": "touch"}
     ),
-    "audio": StageEntry("Trains the audio encoder on frozen image embeddings.", {"joint": "texture"}),
+    "audio": StageEntry("Trains the audio encoder on frozen image embeddings.", {"joint": "texture"}, module="binding"),
     "image_vae": StageEntry("Trains the autoencoder of pictures.", init=True),
     "unclip": StageEntry(
         "Trains the diffusion of pictures from image embeddings.",

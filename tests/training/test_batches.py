@@ -12,8 +12,8 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training import batches
-from unitouch_gen.training.audio import roll_in_time
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
+from unitouch_gen.training.binding import roll_in_time
 
 
 def test_a_batch_is_a_copy_of_its_rows_of_every_column() -> None:

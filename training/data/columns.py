@@ -23,7 +23,7 @@ from unitouch_gen.models.sounds import LogMel
 from unitouch_gen.training.data.cache import Arrays, for_each, mapped
 from unitouch_gen.training.data.contacts import Contacts
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Relit
-from unitouch_gen.training.data.records import Record, abbreviate
+from unitouch_gen.training.data.records import FRAMES, Record, abbreviate
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, MATERIAL_NAMES, SAMPLE_RATE
@@ -62,13 +62,13 @@ class DataConfig(Settings):
 
 
 FIELDS = {"image": "picture", "gel": "background", "audio": "sound", "text": "caption"}
-"""Fields of a record by the names of columns; `touch` and `sensor` are the same."""
+"""Fields of a record by the names of columns; other columns have the names of their fields."""
 
 ColumnKind = tuple[Any, ...]  # dtype, then shape of a row
 
 
 def has(record: Record, column: str) -> bool:
-    """Whether a record has a column that a stage may need: touch, image, gel, audio, text, sensor."""
+    """Whether a record has a column that a stage may need, such as touch, image, gel, audio, text or sensor."""
     return getattr(record, FIELDS.get(column, column)) is not None
 
 
@@ -184,8 +184,10 @@ def decoded(
     size = processor.image_size
     mel = processor.audio
     side = touch_size or size
+    columns_of_frames = {frame: column for column, frame in FIELDS.items()}
+    images = [columns_of_frames.get(frame, frame) for frame in FRAMES]
     kinds: dict[str, ColumnKind] = {
-        "image": (np.uint8, 3, size, size),
+        **dict.fromkeys(images, (np.uint8, 3, size, size)),
         **dict.fromkeys(("touch", "gel"), (np.uint8, 3, side, side)),
         "audio": (np.float16, 1, mel.mel_bins, mel.frames),
     }

@@ -17,10 +17,9 @@ from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import find_file, read_table
-from unitouch_gen.training.data.records import Frame, Record, abbreviate, column_of, find_paths, images_in
+from unitouch_gen.training.data.records import FRAMES, Frame, Record, abbreviate, column_of, find_paths, images_in
 
 LOOKS_LIKE = ()
-FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 COLUMNS = (*FRAMES, *TEXTS, "sound")
 SPLITS = ("train", "val", "test")

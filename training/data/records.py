@@ -1,7 +1,7 @@
 """Records of touches, and helpers with which layouts of data sets find and read them."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,15 @@ class Record:
     @property
     def files(self) -> set[str]:
         """Paths of all its files."""
-        paths = {frame.path for frame in (self.touch, self.picture, self.background) if frame}
+        frames = [getattr(self, name) for name in FRAMES]
+        paths = {frame.path for frame in frames if frame}
         if self.sound:
             paths.add(self.sound)
         return paths
+
+
+FRAMES = tuple(field.name for field in fields(Record) if field.type in (Frame, Frame | None))
+"""Fields of a record that are images in files."""
 
 
 def abbreviate(names: Sequence[str]) -> str:

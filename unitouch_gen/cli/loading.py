@@ -36,10 +36,10 @@ DRAWING = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization"
 
 
 def suffixes_of(modality: str) -> frozenset[str]:
-    """Suffixes of files of a modality: "touch", "image", "height" or "audio"."""
+    """Suffixes of files of a modality; those of images if it has no others."""
     from unitouch_gen.models.videos import VIDEOS
 
-    return {"audio": SOUNDS, "image": IMAGES, "height": IMAGES, "touch": IMAGES.union(VIDEOS)}[modality]
+    return {"audio": SOUNDS, "touch": IMAGES.union(VIDEOS)}.get(modality, IMAGES)
 
 
 def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:

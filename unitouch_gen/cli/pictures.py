@@ -271,8 +271,10 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
 
 def check_inputs(processor: Any, pictures: Sequence[Picture]) -> None:
     """Reads all inputs once, so that one that cannot be read does not end the work of hours."""
-    readers = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
+    from unitouch_gen.models import MODALITIES
+
     for picture in pictures:
-        for name in readers.keys() & picture.inputs.keys():
-            value = picture.inputs[name]
-            readers[name](value, name=f"{name} {value.name}" if is_file(value) else name)
+        for modality in {*MODALITIES} & picture.inputs.keys():
+            value = picture.inputs[modality]
+            name = f"{modality} {value.name}" if is_file(value) else modality
+            processor.inputs(modality, value, name=name)

@@ -197,9 +197,9 @@ class UniTouchConfig(PreTrainedConfig):
             check_integer(name, getattr(self, name), 1)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30)
-        for name in ("vision", "text", "touch", "audio"):
-            width = getattr(self, f"{name}_config").projection_dim
-            check_integer(f"{name}_config.projection_dim", width, self.projection_dim, self.projection_dim)
+        for name in self.sub_configs_defaults:
+            width = getattr(self, name).projection_dim
+            check_integer(f"{name}.projection_dim", width, self.projection_dim, self.projection_dim)
         vision: Any = self.vision_config
         stem = check_choice("vision_config.stem", getattr(vision, "stem", "patch"), ("patch", "residual"))
         if stem == "residual":

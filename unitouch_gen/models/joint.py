@@ -31,8 +31,6 @@ from unitouch_gen.models.sensor_bank import SensorBank, SensorMatch, Sensors
 from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 from unitouch_gen.saving import saved_whole
 
-MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
-
 MODULES: dict[str, tuple[str, ...]] = {
     "image": ("vision_model",),
     "text": ("text_model",),
@@ -40,6 +38,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "touch": ("touch_model", "sensor_bank"),
 }
 """Sub-modules of each modality, and prefixes of their tensors on disk."""
+
+MODALITIES = tuple(MODULES)
 
 UNLIKE = "unlike anything known"
 UNTOUCHED = "nothing is touched"
@@ -141,6 +141,10 @@ class UniTouchModel(PreTrainedModel):
             features = features + touch_model.texture(pixels)
         return features, patches
 
+    def get_features(self, modality: str, **inputs: Tensor) -> Tensor:
+        """Embeddings (B, D) of a modality, of its `UniTouchProcessor.inputs`."""
+        return getattr(self, f"get_{modality}_features")(**inputs)
+
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
         """Image embeddings (B, D) of pixel values (B, 3, S, S) from `UniTouchProcessor.images`."""
@@ -225,8 +229,9 @@ class UniTouchModel(PreTrainedModel):
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with random weights, replacing any existing one."""
         modules = make_modules(self.config, modality)
-        if modality in ("audio", "touch"):
-            modules[MODULES[modality][0]].apply(initialise)
+        for module in modules.values():
+            if isinstance(module, UniTouchViT):  # transformers' classes initialise themselves
+                module.apply(initialise)
         self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:

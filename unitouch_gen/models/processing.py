@@ -82,6 +82,21 @@ class UniTouchProcessor(FeatureExtractionMixin):
         audio = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
         return cls(image_size=config.touch_config.image_height, audio=audio, tokenizer=tokenizer)
 
+    def inputs(self, modality: str, values: Any, *, name: str | None = None) -> dict[str, Tensor]:
+        """The arguments of the model's `get_<modality>_features`, of inputs as pipelines take them.
+
+        Raises:
+            InvalidInputError: If they cannot be read, a text is blank, or a sound silent. The message has `name`, or
+                else the modality.
+        """
+        name = name or modality
+        if modality == "text":
+            return self.text(check_texts(name, values, blank=False), name=name)
+        if modality == "audio":
+            return {"input_values": self.sounds(values, name=name, audible=True)}
+        read = self.touch if modality == "touch" else self.images
+        return {"pixel_values": read(values, name=name)}
+
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images`."""
         return normalise_pixels(self.raw_images(images, name=name))
