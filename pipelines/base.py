@@ -39,6 +39,7 @@ from unitouch_gen.errors import (
     check_fields,
     check_integer,
     check_kind,
+    check_multiple,
     check_number,
     check_tensor,
     check_unused,
@@ -205,8 +206,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             if pixels is None:
                 # A UNet may have no size of its own.
                 pixels = check_integer(name, side, 1) * self.vae_scale_factor
-            if pixels % self.vae_scale_factor:
-                raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {self.vae_scale_factor}.")
+            check_multiple(name, pixels, self.vae_scale_factor)
             sides.append(pixels // self.vae_scale_factor)
         return (inputs * arguments.num_images_per_prompt, self.unet.config.out_channels, *sides)
 

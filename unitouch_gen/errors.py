@@ -202,6 +202,12 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     return float(value)
 
 
+def check_multiple(name: str, value: int, factor: int, of: str = "") -> None:
+    """Raises unless an integer is a multiple of a factor; `of` says what the factor is."""
+    if value % factor:
+        raise InvalidInputError(f"`{name}` is {value}; it has to be a multiple of {of or factor}.")
+
+
 def plain_integer(value: Any) -> Any:
     """An integer of any library as an int; any other value as it is."""
     return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value

@@ -209,8 +209,9 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         return folder
-    if os.path.exists(folder):
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; pass one, or a repository id.")
+    if os.path.exists(folder) or str(place).count("/") != 1:
+        wanted = "pass one, or a repository id such as owner/name"
+        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; {wanted}.")
     from huggingface_hub import snapshot_download
 
     names = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
@@ -220,7 +221,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
             download_options[option] = options[option]
     problem = f"`{name}` is {str(place)!r}, no folder here, and no repository that can be fetched"
     kinds = (OSError, ValueError, ImportError)  # ValueError: no id; ImportError: a SOCKS proxy
-    with explain_errors(problem, "pass a folder, or a repository id", *kinds):
+    with explain_errors(problem, "pass another", *kinds):
         return Path(snapshot_download(str(place), **download_options))
 
 

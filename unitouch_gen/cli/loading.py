@@ -152,9 +152,7 @@ def load_joint_space(model: str | None, device: str) -> tuple[Any, Any]:
 
 
 def folder_of(model: str) -> Path:
-    """The folder of a model; a repository is fetched first. Raises for a name that is no folder and has no owner."""
-    if not os.path.isdir(model) and model.count("/") != 1:
-        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
+    """The folder of a model; a repository is fetched first."""
     return local_folder("--model", model)
 
 

@@ -18,6 +18,7 @@ from unitouch_gen.errors import (
     check_choice,
     check_integer,
     check_kind,
+    check_multiple,
     check_number,
     check_texts,
     did_you_mean,
@@ -84,22 +85,18 @@ class UniTouchViTConfig(PreTrainedConfig):
     def __post_init__(self, **kwargs: Any) -> None:
         check_spelling(UniTouchViTConfig, kwargs)
         super().__post_init__(**kwargs)
-        check_integer("hidden_size", self.hidden_size, 1)
-        check_integer("num_hidden_layers", self.num_hidden_layers, 1)
-        check_integer("num_attention_heads", self.num_attention_heads, 1)
-        check_integer("num_channels", self.num_channels, 1)
-        check_integer("patch_size", self.patch_size, 1)
-        check_integer("patch_stride", self.patch_stride, 1)
-        check_integer("projection_dim", self.projection_dim, 1)
-        check_integer("image_height", self.image_height, self.patch_size)
-        check_integer("image_width", self.image_width, self.patch_size)
-        check_integer("patch_channels", self.patch_channels, 0)
-        check_integer("texture_width", self.texture_width, 0)
+        for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "projection_dim"):
+            check_integer(name, getattr(self, name), 1)
+        for name in ("num_channels", "patch_size", "patch_stride"):
+            check_integer(name, getattr(self, name), 1)
+        for name in ("image_height", "image_width"):
+            check_integer(name, getattr(self, name), self.patch_size)
+        for name in ("patch_channels", "texture_width"):
+            check_integer(name, getattr(self, name), 0)
         check_number("mlp_ratio", self.mlp_ratio, 1e-3)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
-        if self.hidden_size % self.num_attention_heads:
-            heads = f"`num_attention_heads` ({self.num_attention_heads})"
-            raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
+        heads = self.num_attention_heads
+        check_multiple("hidden_size", self.hidden_size, heads, of=f"`num_attention_heads`, which is {heads}")
         if check_choice("stem", self.stem, ("patch", "residual", "relief")) != "patch":
             check_halved(self.patch_size, self.image_height, self.image_width, self.patch_stride)
 

@@ -107,14 +107,14 @@ def firmest(name: str, source: str | os.PathLike | Iterator[ImageInput]) -> Tens
     contacts = [frame for frame in kept if not (noisy and frame.isolated)]
     # In differences of images, the gel at rest is black.
     candidates = _at_rest(stills, noisy) or _at_rest(blank, noisy=False)
-    if not candidates:
-        wanted = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
-        raise InvalidInputError(f"`{name}` shows no contact: {wanted}; begin to record before you press.")
     furthest = [_most_changed(contacts, rest) for rest in candidates]
     firmest_of_each = [frame for frame in furthest if frame is not None]
     if not firmest_of_each:
-        wanted = "no frames differ from the gel at rest; press while it records"
-        raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
+        why = "no frames differ from the gel at rest; press while it records"
+        if not candidates:
+            alike = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
+            why = f"{alike}; begin to record before you press"
+        raise InvalidInputError(f"`{name}` shows no contact: {why}.")
 
     best = firmest_of_each[0]
     rest_has_more = CLEARLY * structure_of(best.small) < structure_of(candidates[0].small)

@@ -67,7 +67,7 @@ def press(
 
     Args:
         height: A height map: a path (8 or 16 bit image, float TIFF, .npy) or an array or tensor (H, W); or one for each
-            contact, as (N, H, W) or a list.
+            contact, as (N, H, W) or a list of any shapes.
         mm: Width of the map, mm, from 0.5 to 10,000.
         sensor: A name in `SENSORS`, or a sensor.
         depth: Depth of the surface beyond first contact, mm, up to 10: one, or one for each contact.
@@ -96,22 +96,23 @@ def press(
         sensor = SENSORS[check_choice("sensor", sensor, SENSORS)]
     maps = height_maps(height, relief_mm)
     depths = [check_number("depth", value, 0.001, 10.0) for value in _listed("depth", depth)]
-    places = [_place(value, mm, maps[0]) for value in _listed("at", at)]
-    count = max(len(maps), len(depths), len(places))
-    for name, values in {"height": len(maps), "depth": len(depths), "at": len(places)}.items():
-        check_count(name, values, count)
+    points = _listed("at", at)
+    count = max(len(maps), len(depths), len(points))
+    for name, values in {"height": maps, "depth": depths, "at": points}.items():
+        check_count(name, len(values), count)
+    maps = maps * count if len(maps) == 1 else maps
+    depths = depths * count if len(depths) == 1 else depths
+    points = points * count if len(points) == 1 else points
+    places = [_place(point, mm, height_map) for point, height_map in zip(points, maps, strict=True)]
 
     # 2. The square of surface under each contact.
     pixels, extent = gel_square(sensor, size)
     heights = list[Tensor]()
-    for row in range(count):
-        height_map = maps[row % len(maps)]
-        place = places[row % len(places)]
+    for height_map, place in zip(maps, places, strict=True):
         heights.append(under_gel(height_map, mm, place, extent=extent, pixels=pixels))
 
     # 3. The gel, and its image.
-    depth_of = torch.tensor([depths[row % len(depths)] for row in range(count)])
-    indentation = indentation_against(torch.stack(heights), depth_of, sensor, extent)
+    indentation = indentation_against(torch.stack(heights), torch.tensor(depths), sensor, extent)
     displacement = gel_displacement(indentation, torch.full((count,), DWELL), sensor, size)
     touch = gel_image(displacement, sensor, size)
     if seed is not None:
@@ -185,7 +186,7 @@ def _range_of(positions: Tensor, size: int) -> tuple[int, int]:
 
 
 def height_maps(height: Any, relief_mm: float, name: str = "height") -> list[Tensor]:
-    """Height maps of all kinds as float32 (H, W) in mm, each relative to its middle height, all of one shape."""
+    """Height maps of all kinds as float32 (H, W) in mm, each relative to its middle height."""
     maps = list[Tensor]()
     if isinstance(height, list | tuple):
         check_not_empty(name, height)
@@ -199,8 +200,6 @@ def height_maps(height: Any, relief_mm: float, name: str = "height") -> list[Ten
         is_stack = values.ndim == 3 and len(values) > 0
         for single in values if is_stack else [values]:
             maps.append(_checked(name, single, relief_mm))
-    if len({single.shape for single in maps}) > 1:
-        raise InvalidInputError(f"`{name}` holds maps of several shapes; pass maps of one shape, or one after another.")
     return maps
 
 
@@ -214,10 +213,11 @@ def _values(name: str, height: Any) -> np.ndarray:
     if isinstance(height, Image.Image):
         return _grey(subject, height)
     if isinstance(height, Tensor):
-        return height.detach().cpu().numpy()
-    if isinstance(height, np.ndarray):
+        height = height.detach().cpu().numpy()
+    if isinstance(height, np.ndarray) and (height.dtype in (np.uint8, np.uint16) or height.dtype.kind == "f"):
         return height
-    raise InvalidTypeError(f"`{name}` is {describe(height)}; pass a path, or an array of heights (H, W).")
+    wanted = "pass a path, or an array (H, W): floats in mm, or uint8 or uint16 as shares of `relief_mm`"
+    raise InvalidTypeError(f"{subject} is {describe(height)}; {wanted}.")
 
 
 def _read(subject: str, content: bytes) -> Image.Image | np.ndarray:
@@ -265,13 +265,8 @@ def _checked(name: str, values: np.ndarray, relief_mm: float) -> Tensor:
     if values.ndim != 2:
         raise InvalidInputError(f"`{name}` is {describe(values)}; pass heights (H, W), or (N, H, W) for N contacts.")
     _check_size(f"`{name}`", values.shape[1], values.shape[0])
-    if values.dtype in (np.uint8, np.uint16):
-        heights = values.astype(np.float64) / np.iinfo(values.dtype).max
-    elif np.issubdtype(values.dtype, np.floating):
-        heights = values.astype(np.float64)
-    else:
-        wanted = "pass floats in mm, or uint8 or uint16 as shares of `relief_mm`"
-        raise InvalidTypeError(f"`{name}` is {describe(values)}; {wanted}.")
+    full_scale = 1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+    heights = values.astype(np.float64) / full_scale
     heights = relief_mm * check_finite(name, torch.from_numpy(heights)).numpy()
     low = heights.min()
     high = heights.max()
