@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
-import huggingface_hub
 import pytest
 import torch
 
@@ -351,25 +350,3 @@ def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_u
         assert child.wait() == 0, child.err
     assert child.out.count("\n") == 1 and child.err == ""  # no tunnel, no server of tools
     assert list((tmp_path / "temporary").iterdir()) == [] and files(here) == before
-
-
-def test_addresses_that_cannot_be_served_are_refused_before_anything_is_read(command, refused):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        refused(command("app", "--port", port, "--model", "gone"), "`--port`", str(port), "in use")
-    refused(command("app", "--host", "192.0.2.1"), "'192.0.2.1'")
-    refused(command("app", "--host", "2001:db8::1"), "'2001:db8::1'")
-
-
-def test_two_models_of_a_kind_are_refused(command, refused, models):
-    model = models["touch-to-image"]
-    refused(command("app", "--port", free_port(), "--model", model, "--model", model), "`--model`", "touch-to-image")
-
-
-def test_a_repository_behind_a_proxy_that_cannot_be_asked_is_refused(command, refused, monkeypatch):
-    monkeypatch.setenv("all_proxy", f"socks5://127.0.0.1:{free_port()}")
-    huggingface_hub.close_session()  # which keeps its proxies
-    try:
-        refused(command("app", "--port", free_port(), "--model", "someone/model"), "`--model` is 'someone/model'")
-    finally:
-        huggingface_hub.close_session()

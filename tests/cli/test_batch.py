@@ -92,26 +92,6 @@ def test_a_manifest_without_an_end_of_line_loses_no_whole_line(here, run, last, 
     assert [line.get("mine") for line in lines(here / "out")] == [*range(1, kept + 1), None]
 
 
-def test_lists_that_say_something_else_are_refused(here, run, refused, files):
-    for table, words, said in (
-        ("touch,promt\nin/dark.png,1\n", [], "Did you mean 'prompt'?"),
-        ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
-        ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
-        ("touch,seed\nin/dark.png,1.5\n", [], "`seed` is 1.5"),
-        ("touch,seed\nin/dark.png,nan\n", [], "`seed` is 'nan'"),
-        (f"touch,seed\nin/dark.png,{2**64}\n", [], f"`seed` is {2**64}"),
-        ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up.png'"),
-        ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`--set` is 'bogus'"),
-        ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),
-    ):
-        (here / "table.csv").write_text(table)
-        refused(run("table.csv", *words), said)
-        assert files(here) == ["in/bright.png", "in/dark.png", "table.csv"]
-    refused(run("in", "-o", "in"), "`--output` is 'in', the folder of the inputs")
-    (here / "empty").mkdir()
-    refused(run("empty"), "`source` is 'empty', where there are no images")
-
-
 @pytest.mark.slow
 def test_processes_of_a_launcher_share_the_work(here, models):
     (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/dark.png,{seed}\n" for seed in range(6)))

@@ -42,11 +42,3 @@ def test_all_that_is_wrong_is_told_and_ends_it_with_1(command, tmp_path):
     assert lines[1].startswith("3 of 8 records cannot be read: 3.png: ")
     assert all(name in lines[1] for name in ("; 4.png: ", "picture4.png", "; 5.png: "))
     assert lines[2] == "1 of 8 touches are there more than once: 0.png = 7.png"
-
-
-def test_a_mistake_is_one_line(command, refused, folder):
-    for words, message in (
-        (["{folder}", "--kind", "touch_and_go"], "Data set 'mine' (touch_and_go; all) has no records"),
-        (["{folder}", "--materials", "wood"], "`materials` names 1 of 2"),
-    ):
-        refused(command("data", "check", *(word.format(folder=folder) for word in words)), message)

@@ -5,32 +5,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
+from tests.helpers.data_sets import pictured_labels, write_pictured
 from unitouch_gen.training.data import heldout
-from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
+from unitouch_gen.world import SENSORS, World
 from unitouch_gen.world.scans import scanned_surfaces
 
 
 @pytest.fixture(scope="module")
 def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Touches of four materials of the world, with pictures of the same contacts, by `gelsight`."""
-    sensor, folder = SENSORS["gelsight"], tmp_path_factory.mktemp("data") / "pictured"
-    names = [np.repeat(range(4), 12), np.tile(np.repeat(range(6), 2), 4), np.tile(range(2), 24)]
-    scene = World(0, image_size=32).render(*map(list, names), modalities=("image", "touch"), sensors=[sensor])
-    rows = ["touch,picture,object,material,split,sensor"]
+    sensor = SENSORS["gelsight"]
+    folder = tmp_path_factory.mktemp("data") / "pictured"
+    write_pictured(folder)
+    names = zip(*pictured_labels(), strict=True)
+    scene = World(0, image_size=32).render(*names, modalities=("image", "touch"), sensors=[sensor])
     for name, images in (("touch", scene.touch[sensor.name]), ("picture", scene.image)):
-        (folder / name).mkdir(parents=True)
         for number, image in enumerate(images):
             pixels = (255 * image).round().byte().movedim(0, -1).numpy()
             Image.fromarray(pixels).save(folder / name / f"{number}.png")
-    for number, (material, thing, _) in enumerate(zip(*names, strict=True)):
-        split = ("train", "train", "train", "val", "test", "test")[thing]
-        stuff = MATERIAL_NAMES[material]
-        rows.append(f"touch/{number}.png,picture/{number}.png,{stuff}{thing},{stuff},{split},gelsight")
-    (folder / "labels.csv").write_text("\n".join(rows))
     return folder
 
 
@@ -81,42 +76,3 @@ def test_a_world_of_scanned_surfaces_has_their_materials_alone(rows_of, models, 
     assert {share for shares in chance.values() for share in shares} == {1 / len(materials)}
     stored = json.loads((tmp_path / "material.json").read_text())
     assert (stored["scanned"], stored["recordings"]) == (1.0, 0.5)
-
-
-REFUSED = [  # words of a command, what is changed in the labels, and what is said
-    (("taste",), None, "`table` is 'taste'"),
-    (("material", "--data", "nowhere"), None, "nowhere"),
-    (("material", "--scanned", "0.5"), None, "`--scanned` is 0.5, but has no effect with `--data`"),
-    (("retrieval", "--recordings", "1"), None, "`--recordings` is 1.0, but has no effect with `--data`"),
-    (("touch-to-image",), None, "holds a XToTouchPipeline; name a saved TouchToImagePipeline"),
-    (("material", "--model", "in"), None, "config.json', which does not exist"),
-    (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),
-    (("grasp",), ("material", "grasp"), "not dropped and lifted"),
-    (("material",), ("material", "stuff"), "the classes none of material to train on, not two or more"),
-    (("retrieval",), ("picture", "photo"), "no audio or image or text of every touch"),
-    (("x-to-touch",), ("gelsight", "mine"), "are by sensors other than"),
-    (("x-to-touch",), ("test", "val"), "and no 'test'"),
-    (("x-to-touch", "--each", "4"), None, "needs 18"),
-]  # fmt: skip
-
-
-def test_what_cannot_be_measured_is_one_line_before_a_file_is_read(command, models, here, refused, pictured):
-    for name in pictured.rglob("*.png"):
-        file = here / "pictured" / name.relative_to(pictured)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(b"no image")
-    for words, change, said in REFUSED:
-        labels = (pictured / "labels.csv").read_text().replace(*change or ("", ""))
-        (here / "pictured" / "labels.csv").write_text(labels)
-        refused(command("evaluate", "--data", "pictured", "--model", models["x-to-touch"], *words), said)
-
-
-@pytest.mark.parametrize("option", ["--scanned", "--recordings"])
-@pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "half"])
-def test_a_share_is_from_none_to_all(command, refused, option, share):
-    refused(command("evaluate", "material", option, share), option)
-
-
-def test_tables_are_not_replaced_unasked(command, refused, tmp_path):
-    (tmp_path / "material.json").write_text("{}")
-    refused(command("evaluate", "material", "-o", tmp_path), "`--output` would replace", "--overwrite")

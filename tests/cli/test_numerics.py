@@ -60,25 +60,3 @@ def test_a_chart_of_error_and_time(here, command, models, target):
         ("euler", 4, None), ("euler", 8, None), ("tolerance", None, 0.1)]  # fmt: skip
     assert rows[1]["error"] < rows[0]["error"]
     assert re.search(r"euler .*4 steps, .*s.*\n", out) and "for an error of" in out
-
-
-def test_bad_input_exits_with_2_and_one_line(here, command, refused, table, files):
-    table(FINE)
-    (here / "other").mkdir()
-    (here / "other/model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
-    for line, words in (
-        ("stability --only fin", "`--only` is 'fin'"),
-        ("stability --only", "requires an argument"),
-        ("stability --model other", "holds a StableDiffusionPipeline; name a saved TouchToImagePipeline"),
-        ("work-precision -o out", "Pass exactly one of `--problem`, `--pipeline`"),
-        (
-            "work-precision -o out --problem mixture-7.5 --model in",
-            "`--model` is 'in', but has no effect with `--problem`",
-        ),
-        ("work-precision -o out --problem mixture-7", "`--problem` is 'mixture-7'"),
-        ("work-precision -o out --problem mixture-7.5 --solvers eulr", "Did you mean 'euler'?"),
-        ("work-precision -o out --problem mixture-7.5 --steps 5,x", "`--steps` is 'x'"),
-        ("work-precision -o out --problem mixture-7.5 --tolerances 2", "`--tolerances` is 2"),
-    ):
-        refused(command(*line.split()), words)
-    assert not files(here / "out")

@@ -35,30 +35,3 @@ def test_one_touch_may_be_named_and_all_sensors_asked_for(command, here):
     code, out, _ = command("press", "example:coin", "--mm", 24, "--sensor", "all", "-o", "all")
     assert code == 0 and "Touches are in" in out
     assert {file.stem for file in (here / "all").iterdir()} == {f"coin-{name}" for name in SENSORS}
-
-
-def test_bad_calls_are_one_line_and_write_nothing(command, refused, files, here):
-    Image.new("L", (16, 16), 9).save("flat.png")
-    Image.new("L", (1, 1)).save("thin.png")
-    before = files(here)
-    for words, *said in (
-        (("flat.png", "-o", "out"), "`height flat.png` is flat"),
-        (("example:coin", "flat.png", "-o", "out"), "`height flat.png` is flat"),
-        (("thin.png", "-o", "out"), "1 x 1 pixels"),
-        (("in/dark.png", "-o", "out"), "is in colours; pass a grey height map"),
-        (("gone.png", "-o", "out"), "'gone.png', which does not exist; pass the path of a height map"),
-        (("example:coin", "--mm", "-3", "-o", "out"), "`mm` is -3"),
-        (("example:coin", "--mm", "wide", "-o", "out"), "--mm"),
-        (("example:coin", "--depth", "nan", "-o", "out"), "`depth` is nan"),
-        (("example:coin", "--sensor", "digt", "-o", "out"), "`--sensor` is 'digt'", "Did you mean 'digit'?"),
-        (("example:coin", "--at", "3", "-o", "out"), "`--at` is '3'", "pass X,Y"),
-        (
-            ("example:coin", "--mm", "24", "--at", "40,0", "-o", "out"),
-            "`at` is 40.0; it has to be a number from -12 to 12",
-        ),
-        (("example:coin", "--sensor", "all", "-o", "out.png"), "'out.png' for 4 pictures"),
-        (("example:coin", "-o", "flat.png"), "`--output` would replace 'flat.png'"),
-        (("flat.png", "--overwrite", "-o", "flat.png"), "would replace 'flat.png'"),
-    ):
-        refused(command("press", *words), *said)
-        assert files(here) == before, words

@@ -8,6 +8,8 @@ import h5py
 import numpy as np
 from PIL import Image
 
+from unitouch_gen.world import MATERIAL_NAMES
+
 Colour = tuple[int, int, int]
 
 RED, BLUE = (200, 40, 30), (40, 50, 210)
@@ -43,3 +45,21 @@ def write_attempts(file: Path, attempts: Sequence[dict[str, Any]]) -> Path:
 def painted(colour: Colour, size: tuple[int, int] = (32, 40)) -> np.ndarray:
     """An image (H, W, 3) of one colour."""
     return np.broadcast_to(np.array(colour, np.uint8), (*size, 3)).copy()
+
+
+def pictured_labels() -> list[tuple[int, int, int]]:
+    """Materials, objects and contacts of `write_pictured`: four, six of each, two of each."""
+    return [(material, thing, contact) for material in range(4) for thing in range(6) for contact in range(2)]
+
+
+def write_pictured(folder: Path) -> None:
+    """The list of a data set of touches with pictures, by `gelsight`, in splits by objects; its images are none yet."""
+    rows = ["touch,picture,object,material,split,sensor"]
+    for number, (material, thing, _) in enumerate(pictured_labels()):
+        split = ("train", "train", "train", "val", "test", "test")[thing]
+        name = MATERIAL_NAMES[material]
+        rows.append(f"touch/{number}.png,picture/{number}.png,{name}{thing},{name},{split},gelsight")
+        for kind in ("touch", "picture"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            (folder / kind / f"{number}.png").write_bytes(b"no image")
+    (folder / "labels.csv").write_text("\n".join(rows))

@@ -1,7 +1,10 @@
 """Real components, small enough to train in a test: a joint space of four modalities and its processor."""
 
 import copy
+import re
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +14,8 @@ from diffusers import AutoencoderTiny
 from tests.helpers.components import AUDIO, clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import Contacts, DataConfig, columns_of
+from unitouch_gen.training.recipe import read, read_recipe
+from unitouch_gen.training.stages import MODULES
 
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
@@ -75,3 +80,10 @@ def vae(tmp_path: Path) -> str:
     """What the stage of an autoencoder leaves."""
     autoencoder(latent_channels=8).save_pretrained(tmp_path / "vae")
     return str(tmp_path / "vae")
+
+
+def read_as(name: str, *overrides: str) -> Any:
+    """A recipe by its name, with values replaced, as its stage reads it."""
+    stage = re.sub("_(paper|pairs|lamps)$", "", name)
+    main = import_module(f"unitouch_gen.training.{MODULES.get(stage, stage)}").main
+    return read(main.__annotations__["recipe"], read_recipe(name, overrides))

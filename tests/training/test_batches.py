@@ -10,7 +10,6 @@ import torch
 from scipy.stats import chisquare
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
 from unitouch_gen.training.binding import roll_in_time
@@ -62,11 +61,6 @@ def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> Non
 def test_a_batch_follows_from_the_number_of_its_step_and_the_seed(indices_of: Callable) -> None:
     assert indices_of(9, seed=7) == indices_of(9, seed=7)
     assert indices_of(0, seed=7) != indices_of(1, seed=7) and indices_of(0, seed=7) != indices_of(0, seed=8)
-
-
-def test_batches_that_cannot_be_filled_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="`batch_size` is 64, but there are 5 samples"):
-        shuffled_indices(0, 5, 64)
 
 
 TIME, PERMUTED = torch.arange(12), [*itertools.permutations(range(3))]

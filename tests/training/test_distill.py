@@ -16,9 +16,6 @@ from torch.testing import assert_close
 
 from tests.helpers.calls import quiet
 from tests.helpers.components import make_components, make_pipelines
-from tests.helpers.data_sets import write_image
-from tests.helpers.small_family import write_small_family
-from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.training.checkpoints import checkpoints_in
@@ -196,51 +193,3 @@ def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
             for one, call in ((known, embeds), (pipe, ours))
         ]
         assert_close(*pictures, atol=1e-5, rtol=1e-4)
-
-
-def test_conditions_are_drawn_as_in_the_teachers_own_training(tmp_path: Path) -> None:
-    """By the record of its family, which is saved with a pipeline also after it was read again."""
-    family = tmp_path / "family"
-    write_small_family(family)
-    objective = {**read_recipe("touch_ldm")["objective"], "condition_noise": 0.9}
-    record = {"stage": "touch_ldm", "recipe": {"objective": objective}}
-    (family / "family.json").write_text(json.dumps({"training": {"touch_ldm": record}}))
-    pipe = quiet(tiny("x-to-touch", family=family))
-    pipe.save_pretrained(tmp_path / "saved")
-    quiet(type(pipe).from_pretrained(tmp_path / "saved")).save_pretrained(tmp_path / "again")
-    assert teacher_objective(tmp_path / "again", "touch_ldm") == objective
-    with pytest.raises(InvalidInputError, match=r"`model: record\.json: stage` is 'touch_ldm'"):
-        teacher_objective(tmp_path / "again", "unclip")
-    (tmp_path / "again" / "record.json").unlink()
-    assert teacher_objective(tmp_path / "again", "touch_ldm") == read_recipe("touch_ldm")["objective"]
-
-
-def test_a_folder_that_is_no_pipeline_and_layers_that_do_not_fit_end_with_a_line(
-    cache: Path, tmp_path: Path, capsys: Any
-) -> None:
-    (tmp_path / "empty").mkdir()
-    write_small_family(tmp_path / "family")
-    quiet(tiny("x-to-touch", family=tmp_path / "family")).save_pretrained(tmp_path / "gels")
-    for file in ("mine/touch/0.png", "mine/picture/0.png", "mine/touch/1.png", "mine/picture/1.png"):
-        write_image(tmp_path / file, (200, 100, len(file)))
-    mine = json.dumps({"path": str(tmp_path / "mine"), "sensor": "digit"}, separators=(",", ":"))
-    make_pipelines()["touch-to-image"].save_pretrained(tmp_path / "teacher")
-    other = shutil.copytree(tmp_path / "teacher", tmp_path / "other")
-    (other / "model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
-    broken = shutil.copytree(tmp_path / "teacher", tmp_path / "broken")
-    shutil.rmtree(broken / "unet")
-    for folder, words, message in (
-        ("gone", "", "'--model'"),
-        ("empty", "", "`model` names "),
-        ("other", "", "is 'StableDiffusionPipeline'; it has to be one of"),
-        ("broken", "", "`model` is "),
-        ("teacher", "--set lora.target_modules=[to_p]", "`lora` does not fit the network"),
-        ("teacher", "--set lora.rank=3", "In `lora`, `rank` is unknown"),
-        ("teacher", "--set objective.timesteps=[9,99]", "`objective.timesteps` is [9, 99]: "),
-        ("gels", f"--set data.drawn=null --set data.sets=[{mine}]", "`data.sets` have no untouched gels"),
-    ):
-        given = words_of(tmp_path / folder, tmp_path / "run", cache, *words.split())
-        with pytest.raises(SystemExit, match="2"):
-            run(given)
-        (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
-        assert message in line and not (tmp_path / "run").exists()
