@@ -174,7 +174,7 @@ def check_arguments(of: str, names: Iterable[str], known: Collection[str]) -> No
             raise InvalidTypeError(f"`{name}` is no argument of {of}. {did_you_mean(name, known)}".strip())
 
 
-def check_kind(name: str, value: Any, *kinds: type) -> Any:
+def check_kind(name: str, value: Any, *kinds: Any) -> Any:
     """An instance of one of `kinds`."""
     if not isinstance(value, kinds):
         classes = " or ".join(kind.__name__ for kind in kinds)
@@ -188,13 +188,13 @@ def check_integer(name: str, value: Any, low: int, high: float = math.inf) -> in
     return int(value)
 
 
-def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, kind: type = Real) -> float:
+def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, kind: Any = Real) -> float:
     """A finite number of a kind from `low` to `high`, as a float. Booleans are not numbers here."""
     if isinstance(value, bool) or not isinstance(value, kind):
         wanted = "an integer" if kind is Integral else "a number"
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {wanted}.")
     try:
-        fits = math.isfinite(value) and low <= value <= high  # type: ignore[operator]
+        fits = math.isfinite(value) and low <= value <= high
     except OverflowError:  # raised by integers beyond the range of floats
         fits = False
     if not fits:

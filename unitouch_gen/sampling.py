@@ -188,7 +188,8 @@ def truncate_schedule(scheduler: Any, share: float) -> Any:
     config = scheduler.config
     betas = getattr(scheduler, "betas", None)
     if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
-        check_unused("with a scheduler that starts at noise alone", init_strength=share)
+        kind = type(scheduler).__name__
+        raise InvalidInputError(f"`init_strength` is {share:g}, but {kind} starts at noise alone; name a `solver`.")
     scheduler.set_timesteps(100)
     spacing = scheduler.timesteps.unique()  # from the smallest
     levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)

@@ -14,8 +14,8 @@ from diffusers import AutoencoderTiny
 from tests.helpers.components import AUDIO, clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import Contacts, DataConfig, columns_of
+from unitouch_gen.training.family import STAGES
 from unitouch_gen.training.recipe import read, read_recipe
-from unitouch_gen.training.stages import MODULES
 
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
@@ -85,5 +85,5 @@ def vae(tmp_path: Path) -> str:
 def read_as(name: str, *overrides: str) -> Any:
     """A recipe by its name, with values replaced, as its stage reads it."""
     stage = re.sub("_(paper|pairs|lamps)$", "", name)
-    main = import_module(f"unitouch_gen.training.{MODULES.get(stage, stage)}").main
+    main = import_module(f"unitouch_gen.training.{STAGES[stage].module or stage}").main
     return read(main.__annotations__["recipe"], read_recipe(name, overrides))

@@ -16,6 +16,8 @@ from torch.testing import assert_close
 
 from tests.helpers.calls import quiet
 from tests.helpers.components import make_components, make_pipelines
+from tests.helpers.small_family import write_small_family
+from unitouch_gen import tiny
 from unitouch_gen.cli import commands
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.training.checkpoints import checkpoints_in
@@ -193,3 +195,20 @@ def test_a_pipeline_becomes_weights_that_are_loaded_as_anybody_loads_them(
             for one, call in ((known, embeds), (pipe, ours))
         ]
         assert_close(*pictures, atol=1e-5, rtol=1e-4)
+
+
+def test_conditions_are_drawn_as_in_the_teachers_own_training(tmp_path: Path) -> None:
+    """By the record of its family, which is saved with a pipeline also after it was read again."""
+    family = tmp_path / "family"
+    write_small_family(family)
+    objective = {**read_recipe("touch_ldm")["objective"], "condition_noise": 0.9}
+    record = {"stage": "touch_ldm", "recipe": {"objective": objective}}
+    (family / "family.json").write_text(json.dumps({"training": {"touch_ldm": record}}))
+    pipe = quiet(tiny("x-to-touch", family=family))
+    pipe.save_pretrained(tmp_path / "saved")
+    quiet(type(pipe).from_pretrained(tmp_path / "saved")).save_pretrained(tmp_path / "again")
+    assert teacher_objective(tmp_path / "again", "touch_ldm") == objective
+    with pytest.raises(InvalidInputError, match=r"`model: record\.json: stage` is 'touch_ldm'"):
+        teacher_objective(tmp_path / "again", "unclip")
+    (tmp_path / "again" / "record.json").unlink()
+    assert teacher_objective(tmp_path / "again", "touch_ldm") == read_recipe("touch_ldm")["objective"]

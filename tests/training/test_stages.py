@@ -200,9 +200,61 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint:
         Stage("touch", TouchRecipe, **given)
 
 
-def commands(runs: Path) -> list[str]:
-    """What `make weights` would run, without the interpreter's path and the cache."""
-    words = ["make", "--dry-run", "weights", f"RUNS={runs}", f"FAMILY={runs / 'family'}"]
+def remaining(runs: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The commands that are left to train a family."""
+    run_commands(app, "unitouch_gen.training", ["family", "--runs", str(runs), "--dry-run"])
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_family_is_trained_in_an_order_in_which_every_run_finds_what_it_takes() -> None:
+    done = set[str]()
+    for run in RUNS:
+        assert {*run.takes.values()} <= done
+        done.add(run.name)
+    assert {run.name for run in FINAL_RUNS} == {
+        run.stage or run.name for run in RUNS
+    }  # of each stage there is a last one
+
+
+def test_a_family_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(remaining(tmp_path, capsys)) == len(RUNS)
+    (tmp_path / "captions").mkdir()
+    (tmp_path / "captions" / "record.json").write_text("{}")
+    checkpoint = tmp_path / "image_text" / "checkpoints" / "step-00000001"
+    checkpoint.mkdir(parents=True)
+    lines = remaining(tmp_path, capsys)
+    assert len(lines) == len(RUNS) - 1 and " --recipe image_text_lamps " in lines[0]  # it has saved nothing yet
+    (checkpoint / "progress.json").write_text("{}")
+    assert remaining(tmp_path, capsys)[0] == (
+        f"python -m unitouch_gen.training image_text --init {tmp_path}/captions/model "
+        f"--output {tmp_path}/image_text --cache {tmp_path}/cache --resume"
+    )
+
+
+def test_a_family_stops_at_a_stage_that_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With the stage's exit code, after its own message."""
+    (tmp_path / "runs").write_text("a file")
+    with pytest.raises(SystemExit, match="2"):
+        run_commands(app, "unitouch_gen.training", ["family", "--runs", str(tmp_path / "runs")])
+    [error] = capfd.readouterr().err.splitlines()
+    assert str(tmp_path / "runs" / "captions") in error and "cannot be written to" in error
+
+
+needs_checkout = pytest.mark.skipif(not (CHECKOUT / "Makefile").is_file(), reason="there is no checkout")
+
+
+@needs_checkout
+def test_the_page_on_training_lists_the_commands_of_a_family(monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.chdir(tmp_path)  # where no run is done
+    lines = [line.replace(" --cache runs/cache", "") for line in remaining(Path("runs"), capsys)]
+    page = (CHECKOUT / "docs" / "training.md").read_text()
+    assert "\n".join(lines) in page
+
+
+@needs_checkout
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+def test_make_weights_trains_a_family_and_puts_it_together(tmp_path: Path) -> None:
+    words = ["make", "--dry-run", "weights", f"RUNS={tmp_path}", f"FAMILY={tmp_path / 'family'}"]
     done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True)
     commands = [re.sub(r"^\S*python", "python", line) for line in done.stdout.splitlines() if str(tmp_path) in line]
     assert commands == [

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -89,7 +90,7 @@ class SensorBank(nn.Module):
         8 x 8 cells. If the bank has `reaches`, an image out of reach of all sensors has none, unless `nearest` is set.
         """
         check_kind("sensor", sensor, str, list, tuple, NoneType)
-        names = list(sensor) if isinstance(sensor, list | tuple) else [sensor]
+        names: list[Any] = list(sensor) if isinstance(sensor, list | tuple) else [sensor]
         check_count("sensor", len(names), len(raw_pixels))
         if len(names) == 1:
             names = names * len(raw_pixels)

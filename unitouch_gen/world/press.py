@@ -98,8 +98,9 @@ def press(
     depths = [check_number("depth", value, 0.001, 10.0) for value in _listed("depth", depth)]
     points = _listed("at", at)
     count = max(len(maps), len(depths), len(points))
-    for name, values in {"height": maps, "depth": depths, "at": points}.items():
-        check_count(name, len(values), count)
+    check_count("height", len(maps), count)
+    check_count("depth", len(depths), count)
+    check_count("at", len(points), count)
     maps = maps * count if len(maps) == 1 else maps
     depths = depths * count if len(depths) == 1 else depths
     points = points * count if len(points) == 1 else points
