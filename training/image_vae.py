@@ -6,6 +6,7 @@ place of an `AutoencoderKL`, at a fraction of its time. `VQModel` (Esser et al.,
 
 import json
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,17 @@ from unitouch_gen.models.autoencoders import (
 )
 from unitouch_gen.models.features import in_batches
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.models.vit import Residual
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage
+from unitouch_gen.training.texture import read_trunk
+from unitouch_gen.weights import JOINT
+
+TRUNK_BLOCKS = (0, 2, 4)
+"""Blocks of the texture trunk that pictures are compared by: strides of 2, 4 and 8 pixels."""
 
 
 class AutoencoderLoss(Settings):
@@ -40,7 +47,16 @@ class AutoencoderLoss(Settings):
     # Deviation of noise on the latents, relative to theirs. The decoder learns to ignore a generator's last errors.
     latent_noise: NonNegativeFloat
     latent_weight: NonNegativeFloat  # of the latents' mean square, which keeps them bounded
-    feature_weight: NonNegativeFloat = 0.0  # of `feature_error`, by the touch encoder of the joint space
+    # Of `feature_error`: of touches by the stem of the joint space's touch encoder, of pictures by its texture trunk.
+    feature_weight: NonNegativeFloat = 0.0
+    # Of `contrast_error`, by the same features. Fine grain is more than latents can hold: the error of pixels is least
+    # where it is averaged away, this one where as much of it is drawn as there was.
+    contrast_weight: NonNegativeFloat = 0.0
+    trunk: str | None = None  # folder of a joint space to take the texture trunk from; the built-in one if left out
+
+    @property
+    def takes_features(self) -> bool:
+        return bool(self.feature_weight or self.contrast_weight)
 
 
 class AutoencoderAugmentation(Settings):
@@ -55,20 +71,59 @@ class AutoencoderRecipe(Recipe):
     augment: AutoencoderAugmentation = AutoencoderAugmentation()
 
 
-class AutoencoderObjective(nn.Module):
-    """Reconstruction of pixels from noisy latents, and a VQ model's commitment (van den Oord et al., 2017, Eq. 3)."""
+class StemFeatures(nn.Module):
+    """Features of a touch encoder's stem: images in [0, 1] -> outputs of its residual layers and of its last one."""
 
-    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss, crop: int | None = None, layers: Any = ()):
+    def __init__(self, layers: Sequence[nn.Module]):
+        super().__init__()
+        self.layers = nn.ModuleList(layers).requires_grad_(False)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        x = normalise_pixels(images)
+        outputs = list[Tensor]()
+        for layer in self.layers:
+            x = layer(x)
+            if isinstance(layer, Residual) or layer is self.layers[-1]:
+                outputs.append(x)
+        return outputs
+
+
+class TrunkFeatures(nn.Module):
+    """Features of the texture trunk: images in [0, 1] -> outputs of the blocks `TRUNK_BLOCKS`."""
+
+    def __init__(self, trunk: TextureTrunk):
+        super().__init__()
+        self.trunk = trunk
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        return self.trunk.layers(images, TRUNK_BLOCKS)
+
+
+class AutoencoderObjective(nn.Module):
+    """Reconstruction of pixels from noisy latents, and a VQ model's commitment (van den Oord et al., 2017, Eq. 3).
+
+    `features` maps images in [0, 1] to a list of features (B, C, h, w), which the losses of features need.
+    """
+
+    def __init__(
+        self,
+        vae: Autoencoder,
+        weights: AutoencoderLoss,
+        crop: int | None = None,
+        features: nn.Module | None = None,
+    ):
         super().__init__()
         self.trained = vae
         self.weights = weights
         self.crop = crop
-        self.layers = layers
+        self.features = features
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
         if self.crop is not None:
             pixels = random_crop(pixels, self.crop)
+        if pixels.device.type == "cpu":
+            pixels = pixels.to(memory_format=torch.channels_last)  # takes three quarters of the time
         latents = encode_raw(self.trained, pixels).float()
         latent_size = latents.square().mean()
         noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
@@ -80,10 +135,25 @@ class AutoencoderObjective(nn.Module):
         loss = loss + self.weights.latent_weight * latent_size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
-        if self.layers:
-            loss = loss + self.weights.feature_weight * feature_error(self.layers, restored, pixels)
+        parts = self.feature_losses(restored, pixels) if self.features is not None else {}
+        for name, part in parts.items():
+            loss = loss + getattr(self.weights, f"{name}_weight") * part
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # of pixels in [0, 1]
-        return {"loss": loss, "psnr": psnr, "latent": latent_size.detach()}
+        shown = {name: part.detach() for name, part in parts.items()}
+        return {"loss": loss, "psnr": psnr, "latent": latent_size.detach(), **shown}
+
+    def feature_losses(self, restored: Tensor, pixels: Tensor) -> dict[str, Tensor]:
+        """The losses of features of images in [-1, 1], by the names of their weights."""
+        features: Any = self.features
+        made = features(restored / 2 + 0.5)
+        with torch.no_grad():
+            real = features(pixels / 2 + 0.5)
+        losses = dict[str, Tensor]()
+        if self.weights.feature_weight:
+            losses["feature"] = feature_error(made, real)
+        if self.weights.contrast_weight:
+            losses["contrast"] = contrast_error(made, real)
+        return losses
 
 
 def random_crop(pixels: Tensor, side: int) -> Tensor:
@@ -94,19 +164,37 @@ def random_crop(pixels: Tensor, side: int) -> Tensor:
     return pixels[..., top : top + side, left : left + side]
 
 
-def feature_error(layers: Sequence[nn.Module], images: Tensor, targets: Tensor) -> Tensor:
-    """L1 error of a stem's features of images in [-1, 1], relative to their deviation (after Johnson et al., 2016)."""
-    features = normalise_pixels(images / 2 + 0.5)
-    target_features = normalise_pixels(targets / 2 + 0.5)
+def feature_error(made: Sequence[Tensor], real: Sequence[Tensor]) -> Tensor:
+    """L1 error of features (B, C, h, w), relative to their deviation by channel (after Johnson et al., 2016)."""
     errors = list[Tensor]()
-    for layer in layers:
-        features = layer.to(features.device)(features)
-        target_features = layer(target_features)
-        if isinstance(layer, Residual) or layer is layers[-1]:
-            error = (features - target_features).abs().mean((0, 2, 3))
-            deviation = target_features.std((0, 2, 3)).clamp_min(1e-3)
-            errors.append((error / deviation).mean())
+    for one, other in zip(made, real, strict=True):
+        error = (one - other).abs().mean((0, 2, 3))
+        errors.append((error / deviations(other)).mean())
     return torch.stack(errors).mean()
+
+
+def contrast_error(made: Sequence[Tensor], real: Sequence[Tensor], cells: int = 2) -> Tensor:
+    """L1 error of the deviation of features (B, C, h, w) within `cells` x `cells` parts of an image, relative as above.
+
+    It does not see where in a part a texture lies (as Gatys et al., 2015, who take all covariances).
+    """
+    errors = list[Tensor]()
+    for one, other in zip(made, real, strict=True):
+        error = (local_deviation(one, cells) - local_deviation(other, cells)).abs().mean((0, 2, 3))
+        errors.append((error / deviations(other)).mean())
+    return torch.stack(errors).mean()
+
+
+def local_deviation(features: Tensor, cells: int) -> Tensor:
+    """Standard deviation of features (B, C, h, w) within each of `cells` x `cells` parts, (B, C, cells, cells)."""
+    mean = F.adaptive_avg_pool2d(features, cells)
+    square = F.adaptive_avg_pool2d(features.square(), cells)
+    return (square - mean.square()).clamp_min(1e-4).sqrt()
+
+
+def deviations(features: Tensor) -> Tensor:
+    """Standard deviation of each channel of features (B, C, h, w)."""
+    return features.std((0, 2, 3)).clamp_min(1e-3)
 
 
 def to_signed(pixels: Tensor) -> Tensor:
@@ -143,6 +231,18 @@ def cached_latents(
     return stage.computed_once(f"{name}-latents-scale{vae.config.scaling_factor:.6g}", "vae", splits, encode_all)
 
 
+def features_of(stage: Stage, loss: AutoencoderLoss) -> nn.Module:
+    """The frozen network that images are compared by: the stem of `--joint`'s touch encoder, or the texture trunk."""
+    if stage.name == "touch_vae":
+        stem = stage.joint_space("touch").touch_model.stem
+        return StemFeatures([*stem.children()] or [stem])
+    folder = JOINT if loss.trunk is None else Path(loss.trunk)
+    trunk = read_trunk(folder)
+    if trunk is None:
+        raise InvalidInputError(f"`loss.trunk` is {str(folder)!r}, which holds no trunk of texture.")
+    return TrunkFeatures(trunk)
+
+
 def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     modality = "touch" if stage.name == "touch_vae" else "image"
     init = stage.folders.get("init")
@@ -152,18 +252,13 @@ def main(stage: Stage, recipe: AutoencoderRecipe) -> None:
     vae: Any = read_autoencoder(init).requires_grad_(True) if init else build("model", vae_class, arguments)
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(f"`augment.crop` is {crop}; take a multiple of {scale_factor(vae)}, a latent's side.")
-    layers: list[nn.Module] = []
-    if recipe.loss.feature_weight:
-        if "joint" not in stage.folders:
-            raise InvalidInputError("`loss.feature_weight` is of a touch encoder's features; only touch_vae takes it.")
-        stem = stage.joint_space("touch").touch_model.stem.requires_grad_(False)
-        layers = [*stem.children()] or [stem]
+    features = features_of(stage, recipe.loss) if recipe.loss.takes_features else None
     splits = stage.splits(modality)
     images = [getattr(split, modality) for split in splits]
     if modality == "touch":
         images += [split.second for split in splits if split.second is not None]
     dataset = ArrayDataset(pixels=images)
-    stage.fit(AutoencoderObjective(vae, recipe.loss, crop, layers), dataset)
+    stage.fit(AutoencoderObjective(vae, recipe.loss, crop, features), dataset)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)

@@ -38,7 +38,7 @@ STAGES = [
     ("image_vae --resume", "`resume` finds no checkpoint in 'runs/image_vae'"),
     ("image_vae --set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
     ("image_vae --set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
-    ("image_vae --set loss.feature_weight=1", "only touch_vae takes it"),
+    ("image_vae --set loss.feature_weight=1 --set loss.trunk={joint}", "which holds no trunk of texture"),
     ("touch_llm --joint {joint} --llama {joint} --set model.hidden_size=16", "`model` is that of `--llama`"),
     ("touch --joint {joint} --set data.drawn.sensors=[digit]", "sigma` is 0.75, with no other data set"),
     ("touch_ldm --joint {joint} --vae {vae} --set model.in_channels=8", "The network has {'in_channels': 8}"),

@@ -141,15 +141,28 @@ def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differen
 
 def test_the_error_of_features_is_that_of_a_stem_relative_to_what_it_sees() -> None:
     layer, deviation = nn.Conv2d(3, 4, 3), torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]  # CLIP's
-    shown, wanted = (to_signed(torch.from_numpy(pictures)) for pictures in (PICTURES[::-1].copy(), PICTURES))
+    shown, wanted = (torch.from_numpy(pictures).float() / 255 for pictures in (PICTURES[::-1].copy(), PICTURES))
+    features = image_vae.StemFeatures([layer])
     with torch.no_grad():
-        apart = F.conv2d((shown - wanted) / 2 / deviation, layer.weight).abs().mean(dim=(0, 2, 3))
-        size = F.conv2d(wanted / 2 / deviation, layer.weight).transpose(0, 1).flatten(1).std(dim=1)  # of what varies
+        apart = F.conv2d((shown - wanted) / deviation, layer.weight).abs().mean(dim=(0, 2, 3))
+        size = F.conv2d(wanted / deviation, layer.weight).transpose(0, 1).flatten(1).std(dim=1)  # of what varies
         for _ in range(2):
-            error = image_vae.feature_error([layer], shown, wanted).item()
+            error = image_vae.feature_error(features(shown), features(wanted)).item()
             assert error == pytest.approx((apart / size).mean().item(), rel=1e-2)
             layer.weight *= 7.0  # a stem that is as much louder
-    assert image_vae.feature_error([layer], wanted, wanted).item() == 0.0
+    assert image_vae.feature_error(features(wanted), features(wanted)).item() == 0.0
+
+
+def test_the_error_of_contrast_sees_how_much_a_texture_varies_and_not_where() -> None:
+    texture = torch.randn(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    parts = texture.unflatten(2, (2, 8)).unflatten(4, (2, 8))  # 2 x 2 parts of 8 x 8
+    within = parts.std(dim=(3, 5), correction=0)
+    moved = parts.flip(3, 5).flatten(4, 5).flatten(2, 3)
+    assert not torch.equal(moved, texture)
+    assert image_vae.contrast_error([moved + 1.0], [texture]).item() == pytest.approx(0.0, abs=1e-5)
+    expected = 0.5 * within.mean(dim=(0, 2, 3)) / texture.transpose(0, 1).flatten(1).std(dim=1)
+    error = image_vae.contrast_error([0.5 * texture], [texture]).item()
+    assert error == pytest.approx(expected.mean().item(), rel=1e-4)
 
 
 def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:

@@ -53,7 +53,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_llm": ("bridge.intermediate_size=24",),
 }  # fmt: skip
 NOT_LEARNED = ("known", "prototypes", "mean", "deviation")
-FROZEN = defaultdict(set, touch_llm={"language_model"})
+FROZEN = defaultdict(set, touch_llm={"language_model"}, image_vae={"features"}, touch_vae={"features"})
 """Parts of an objective that are not trained."""
 
 

@@ -6,6 +6,8 @@ networks"; "Lite" has no squeeze-and-excitation and clips activations at 6) up t
 is stationary (Gatys et al., 2015, "Texture synthesis using convolutional neural networks", take all covariances).
 """
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -65,13 +67,13 @@ class TextureTrunk(nn.Module):
                 channels = out_channels
         self.requires_grad_(False)
 
-    def layers(self, images: Tensor) -> list[Tensor]:
-        """Outputs (B, C, h, w) of the `TAPPED` blocks."""
+    def layers(self, images: Tensor, tapped: Sequence[int] = TAPPED) -> list[Tensor]:
+        """Outputs (B, C, h, w) of the blocks with the indices `tapped`, in ascending order."""
         x = F.relu6(self.stem((images * 255.0 - 127.0) / 128.0))  # the normalisation it was trained with
         outputs = []
-        for number, block in enumerate(self.blocks):
+        for number, block in enumerate(self.blocks[: max(tapped) + 1]):
             x = block(x)
-            if number in TAPPED:
+            if number in tapped:
                 outputs.append(x)
         return outputs
 
