@@ -110,6 +110,21 @@ def shuffled_indices(step: int, size: int, batch_size: int, seed: int = 0) -> li
     return order[place * batch_size : (place + 1) * batch_size].tolist()
 
 
+def two_part_indices(step: int, in_first: np.ndarray, share: float, batch_size: int, seed: int = 0) -> list[int]:
+    """round(share B) of the samples where `in_first` (N,) is true, the rest from the others.
+
+    If one of the two parts is empty, the whole batch is from the other.
+    """
+    rng = np.random.default_rng((seed, step))
+    first = np.flatnonzero(in_first)
+    second = np.flatnonzero(~in_first)
+    count = round(share * batch_size)
+    if len(first) == 0 or len(second) == 0:
+        count = batch_size if len(first) else 0
+    chosen = [first[_draw(rng, len(first), count)], second[_draw(rng, len(second), batch_size - count)]]
+    return np.concatenate(chosen).tolist()
+
+
 def _draw(rng: np.random.Generator, size: int, count: int) -> np.ndarray:
     """`count` of `size` indices, without repetition where that is possible."""
     if count == 0:

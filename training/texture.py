@@ -5,6 +5,7 @@ The encoders and the network are frozen, so their outputs on the training data a
 drawn pictures, the distance to the embedding without texture is penalised, so that the space stays where it was.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,10 @@ from unitouch_gen.models.features import float_pixels, image_embeddings, in_batc
 from unitouch_gen.models.joint import stored_tensors
 from unitouch_gen.models.texture import Texture, TextureHead, TextureTrunk
 from unitouch_gen.models.vit import StemmedCLIPVisionModel
-from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.batches import ArrayDataset, Batch, two_part_indices
 from unitouch_gen.training.data import Contacts
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import Settings
+from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Recipe, Stage, weights_of
 from unitouch_gen.training.touch import fit_distance
 from unitouch_gen.weights import JOINT
@@ -52,12 +53,14 @@ class TextureLosses(Settings):
     image_name: NonNegativeFloat  # cross-entropy of a picture's material, against the embeddings of all names
     touch_name: NonNegativeFloat  # the same of both touches
     drawn: NonNegativeFloat  # 1 - cosine between the embeddings of a drawn picture with and without texture
+    drawn_touch: NonNegativeFloat = 0.0  # the same of both touches of a drawn contact
     noise: NonNegativeFloat = 0.0  # standard deviation of the noise, in units of each statistic's own
 
 
 class TextureRecipe(Recipe):
     model: TextureSettings
     objective: TextureLosses
+    scanned: Share  # share of a batch that is of scanned surfaces, where there are any
 
 
 class TextureObjective(nn.Module):
@@ -79,7 +82,6 @@ class TextureObjective(nn.Module):
         image = self.embedded(self.image, batch, "image")
         touch = self.embedded(self.touch, batch, "touch")
         second = self.embedded(self.touch, batch, "second")
-        distance = 1.0 - F.cosine_similarity(image, batch["image_embeds"], dim=1)
         bound = symmetric_info_nce(touch, image, self.temperature) + symmetric_info_nce(second, image, self.temperature)
         parts = {
             "image": bound,
@@ -87,7 +89,8 @@ class TextureObjective(nn.Module):
             "text": symmetric_info_nce(image, batch["text_embeds"], self.temperature),
             "image_name": self.name_loss(image, batch["material"]),
             "touch_name": self.name_loss(touch, batch["material"]) + self.name_loss(second, batch["material"]),
-            "drawn": (distance * batch["drawn"]).sum() / batch["drawn"].sum().clamp_min(1.0),
+            "drawn": self.change(image, batch, "image"),
+            "drawn_touch": self.change(touch, batch, "touch") + self.change(second, batch, "second"),
         }
         loss = torch.stack([getattr(self.losses, name) * part for name, part in parts.items()]).sum()
         return {"loss": loss, **{name: part.detach() for name, part in parts.items()}}
@@ -97,6 +100,11 @@ class TextureObjective(nn.Module):
         statistics = batch[f"{name}_statistics"]
         noise = self.losses.noise * head.deviation * torch.randn_like(statistics)
         return batch[f"{name}_embeds"] + head(statistics + noise)
+
+    def change(self, embeds: Tensor, batch: Batch, name: str) -> Tensor:
+        """Mean of 1 - cosine between embeddings (B, D) with and without texture, over the drawn contacts of a batch."""
+        distance = 1.0 - F.cosine_similarity(embeds, batch[f"{name}_embeds"], dim=1)
+        return (distance * batch["drawn"]).sum() / batch["drawn"].sum().clamp_min(1.0)
 
     def name_loss(self, embeds: Tensor, material: Tensor) -> Tensor:
         """Cross-entropy of the materials (B,) of embeddings (B, D) against the embeddings of all names."""
@@ -205,7 +213,9 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
     touches.head.fit(torch.cat([columns["touch_statistics"], columns["second_statistics"]]))
 
     objective = TextureObjective(model, recipe.objective, name_embeddings(model, stage.processor))
-    stage.fit(objective, ArrayDataset(**columns))
+    is_scanned = (columns["drawn"] == 0.0).numpy()
+    indices_of = partial(two_part_indices, in_first=is_scanned, share=recipe.scanned, **stage.batches)
+    stage.fit(objective, ArrayDataset(**columns), indices_of)
     with torch.no_grad():
         embeds = columns["image_embeds"] + pictures.head(columns["image_statistics"])
     model.config.embedding_norm = embeds.norm(dim=1).mean().item()

@@ -13,7 +13,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import denormalise_pixels
 from unitouch_gen.models.texture import TAPPED, TextureTrunk
-from unitouch_gen.training.texture import TRUNK, check_takes_texture, read_trunk
+from unitouch_gen.training.texture import TRUNK, TextureLosses, TextureObjective, check_takes_texture, read_trunk
 from unitouch_gen.training.touch import LossWeights, TouchEncoder
 
 
@@ -68,6 +68,17 @@ def test_texture_is_added_to_embeddings(tmp_path: Path) -> None:
     again = UniTouchModel.from_pretrained(tmp_path)
     assert torch.equal(again.get_image_features(pixels), found[0])
     assert torch.equal(again.get_touch_features(pixels, ids), found[1])
+
+
+def test_only_changes_of_drawn_contacts_are_penalised() -> None:
+    weights = dict.fromkeys(("image", "touch", "text", "image_name", "touch_name", "drawn", "drawn_touch"), 1.0)
+    objective = TextureObjective(with_texture(), TextureLosses(**weights), torch.eye(3, 32))
+    embeds = torch.eye(4, 32)
+    batch = {"touch_embeds": embeds, "drawn": torch.tensor([1.0, 1.0, 0.0, 0.0])}
+    turned = torch.stack([embeds[0], embeds[0], -embeds[2], -embeds[3]])  # by 0, 90, 180 and 180 degrees
+    torch.testing.assert_close(objective.change(turned, batch, "touch"), torch.tensor(0.5))
+    batch["drawn"] = torch.zeros(4)
+    assert objective.change(turned, batch, "touch") == 0.0
 
 
 def test_a_trunk_learns_nothing() -> None:

@@ -11,7 +11,13 @@ from scipy.stats import chisquare
 from torch import Tensor
 
 from unitouch_gen.training import batches
-from unitouch_gen.training.batches import ArrayDataset, SamplerSettings, in_batch_indices, shuffled_indices
+from unitouch_gen.training.batches import (
+    ArrayDataset,
+    SamplerSettings,
+    in_batch_indices,
+    shuffled_indices,
+    two_part_indices,
+)
 from unitouch_gen.training.binding import roll_in_time
 
 
@@ -47,6 +53,20 @@ def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() 
     np.testing.assert_allclose(np.where(chosen, 0, counts).sum(axis=0), expected, rtol=0.05)
     uniform = sum(sources(in_batch_indices(step, SIZES, 24, SamplerSettings(), seed=2)) for step in range(500))
     assert chisquare(uniform, uniform.sum() * SIZES / SIZES.sum()).pvalue > 0.01
+
+
+def test_a_batch_has_its_share_of_either_part_and_each_sample_of_a_part_as_often() -> None:
+    in_first = np.arange(50) % 5 == 0
+    batches = [two_part_indices(step, in_first, 0.6, 10, seed=1) for step in range(1000)]
+    assert all(in_first[batch].sum() == 6 and len({*batch}) == 10 for batch in batches)
+    counts = np.bincount(np.concatenate(batches), minlength=50)
+    assert chisquare(counts[in_first]).pvalue > 0.01
+    assert chisquare(counts[~in_first]).pvalue > 0.01
+
+
+@pytest.mark.parametrize("in_first", [np.ones(50, dtype=bool), np.zeros(50, dtype=bool)])
+def test_a_batch_of_one_part_is_whole(in_first: np.ndarray) -> None:
+    assert len({*two_part_indices(0, in_first, 0.6, 10)}) == 10
 
 
 def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> None:
