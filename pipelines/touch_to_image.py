@@ -33,6 +33,7 @@ from unitouch_gen.errors import (
     check_tensor,
     check_texts,
     check_unused,
+    one_each,
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
@@ -333,9 +334,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             check_count(f"{name}_embeds", len(embeds), batch_size)
             return embeds
         self._require(name, "text_encoder", "tokenizer")
-        texts = check_texts(name, default if prompt is None else prompt)
-        check_count(name, len(texts), batch_size)
-        return texts * batch_size if len(texts) == 1 else texts
+        return one_each(name, check_texts(name, default if prompt is None else prompt), batch_size)
 
     # Encoding ---------------------------------------------------------------------------------------------------------
 

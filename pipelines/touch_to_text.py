@@ -15,7 +15,6 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from unitouch_gen.errors import (
     InvalidInputError,
-    check_count,
     check_integer,
     check_kind,
     check_passed,
@@ -24,6 +23,7 @@ from unitouch_gen.errors import (
     check_unused,
     did_you_mean,
     explain_errors,
+    one_each,
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
@@ -192,14 +192,13 @@ class TouchToTextPipeline(UniTouchPipeline):
         """Token ids of a prompt for each of `count` inputs, or of several for a single one."""
         questions = check_texts("question", question, blank=False)
         if count > 1:
-            check_count("question", len(questions), count)
+            questions = one_each("question", questions, count)
         texts = [self.config["prompt_template"].replace(QUESTION, text) for text in questions]
         chat = getattr(self.tokenizer, "chat_template", None) is not None  # which writes the special tokens itself
         if chat:
             turns = [[{"role": "user", "content": text}] for text in texts]
             texts = self.tokenizer.apply_chat_template(turns, tokenize=False, add_generation_prompt=True)
-        prompts = self.tokenizer(texts, add_special_tokens=not chat)["input_ids"]
-        return prompts * count if len(prompts) == 1 else prompts
+        return self.tokenizer(texts, add_special_tokens=not chat)["input_ids"]
 
     def _check_options(
         self, prompts: list[list[int]], max_new_tokens: int | None, options: dict[str, Any]

@@ -21,6 +21,7 @@ from unitouch_gen.errors import (
     check_passed,
     check_tensor,
     check_unused,
+    one_each,
 )
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
@@ -366,6 +367,4 @@ class XToTouchPipeline(UniTouchPipeline):
             labels = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
         name = "sensor" if background is None else "background"
         check_not_empty(name, labels)
-        if inputs > 1:
-            check_count(name, len(labels), inputs)
-        return pictures, labels * inputs if len(labels) == 1 else labels
+        return pictures, labels if inputs == 1 else one_each(name, labels, inputs)

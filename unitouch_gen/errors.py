@@ -303,6 +303,12 @@ def check_count(name: str, count: int, inputs: int) -> None:
         raise InvalidInputError(f"`{name}` holds {count} for {inputs} inputs; pass one, or one each.")
 
 
+def one_each(name: str, values: Sequence[Any], inputs: int) -> list[Any]:
+    """A list with one of the values for each input; a single value serves all of them."""
+    check_count(name, len(values), inputs)
+    return [*values] * inputs if len(values) == 1 else [*values]
+
+
 def check_not_empty(name: str, values: Sized) -> None:
     """Raises if a list is empty."""
     if len(values) == 0:

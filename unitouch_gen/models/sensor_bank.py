@@ -3,13 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_count, check_kind, check_unused
+from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, check_unused, one_each
 
 Sensors = str | Sequence[str | None] | None
 """A name for all images, one for each, or `None` to retrieve them."""
@@ -90,10 +89,7 @@ class SensorBank(nn.Module):
         8 x 8 cells. If the bank has `reaches`, an image out of reach of all sensors has none, unless `nearest` is set.
         """
         check_kind("sensor", sensor, str, list, tuple, NoneType)
-        names: list[Any] = list(sensor) if isinstance(sensor, list | tuple) else [sensor]
-        check_count("sensor", len(names), len(raw_pixels))
-        if len(names) == 1:
-            names = names * len(raw_pixels)
+        names = one_each("sensor", sensor if isinstance(sensor, list | tuple) else [sensor], len(raw_pixels))
         indices = [None if name is None else self.index(name) for name in names]
         if not self.names:
             return [SensorMatch(None, None)] * len(raw_pixels)

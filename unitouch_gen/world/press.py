@@ -19,7 +19,6 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     check_choice,
-    check_count,
     check_file,
     check_finite,
     check_integer,
@@ -27,6 +26,7 @@ from unitouch_gen.errors import (
     check_number,
     describe,
     explain_errors,
+    one_each,
 )
 from unitouch_gen.world.draws import generator
 from unitouch_gen.world.gel import gel_displacement, gel_image, gel_square, in_view, indentation_against
@@ -98,12 +98,9 @@ def press(
     depths = [check_number("depth", value, 0.001, 10.0) for value in _listed("depth", depth)]
     points = _listed("at", at)
     count = max(len(maps), len(depths), len(points))
-    check_count("height", len(maps), count)
-    check_count("depth", len(depths), count)
-    check_count("at", len(points), count)
-    maps = maps * count if len(maps) == 1 else maps
-    depths = depths * count if len(depths) == 1 else depths
-    points = points * count if len(points) == 1 else points
+    maps = one_each("height", maps, count)
+    depths = one_each("depth", depths, count)
+    points = one_each("at", points, count)
     places = [_place(point, mm, height_map) for point, height_map in zip(points, maps, strict=True)]
 
     # 2. The square of surface under each contact.
