@@ -165,7 +165,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         missing = " and ".join(f"`{part}`" for part in parts if getattr(self, part) is None)
         if missing:
             raise InvalidInputError(
-                f"`{argument}` needs {missing}, which this pipeline lacks; build it with that, or {instead}."
+                f"`{argument}` needs {missing}, which this pipeline lacks; build it with them, or {instead}."
             )
 
     def _joint(self, argument: str) -> Any:
