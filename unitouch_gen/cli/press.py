@@ -10,7 +10,7 @@ from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import files_of
 from unitouch_gen.cli.options import SEVERAL
 from unitouch_gen.cli.pictures import save, unique
-from unitouch_gen.errors import check_choice, explain_errors
+from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import replacing
 
 MM_PER_LEVEL = 1e-4  # of depth maps; 65,535 levels reach 6.5 mm, more than the thickness of any gel
@@ -90,8 +90,10 @@ def press(
 
 def place_of(word: str) -> tuple[float, float]:
     """A place from the text of an option."""
-    with explain_errors(f"`--at` is {word!r}", "pass X,Y in mm from the centre, such as 5,-3", ValueError):
+    try:
         x, y = map(float, word.split(","))
+    except ValueError as error:
+        raise InvalidInputError(f"`--at` is {word!r}; pass X,Y in mm from the centre, such as 5,-3.") from error
     return x, y
 
 
