@@ -9,7 +9,6 @@ import sys
 import types
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from tests.helpers.published import features_of, inputs_of, published, sizes
 from unitouch_gen import weights
 from unitouch_gen.convert import convert_published, open_checkpoint
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 
 
 @pytest.fixture(scope="module")
@@ -88,16 +87,6 @@ def test_files_of_another_network_change_nothing(tmp_path):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.ckpt"]
 
 
-def test_files_that_are_exchanged_or_left_out_are_told(files, tmp_path):
-    for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
-        with pytest.raises(InvalidInputError, match=r"`touch` is for UniTouch's last_new.ckpt"):
-            convert_published(tmp_path / "model", **{name: files[other]}, config=sizes())
-    with pytest.raises(InvalidInputError, match="Pass at least one of `imagebind`, `touch`"):
-        convert_published(tmp_path / "model", config=sizes())
-    with pytest.raises(InvalidInputError, match=r"`config\.sensors` is"):
-        convert_published(tmp_path / "model", touch=files["touch"], config=UniTouchConfig(sensors=["digit"]))
-
-
 # Checkpoints ----------------------------------------------------------------------------------------------------------
 
 WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.ones(4, dtype=torch.float16)}
@@ -151,25 +140,6 @@ def test_code_in_a_pickle_is_not_run(tmp_path):
         with pytest.raises(InvalidInputError, match=r"holds more than weights: .*mkdir, of which nothing was run"):
             open_checkpoint("touch", file)
     assert not trap.exists()
-
-
-NO_FILE: dict[str, Any] = {
-    "empty": lambda file: file.write_bytes(b""),
-    "text": lambda file: file.write_bytes(b"these are no weights\n" * 10),
-    "archive": lambda file: file.write_bytes(b"PK\x03\x04" + bytes(200)),
-    "missing": lambda file: None,
-    "a tensor": lambda file: torch.save(torch.ones(3), file),
-    "numbers": lambda file: torch.save({"state_dict": {"epoch": 1}}, file),
-}
-
-
-@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
-def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, suffix):
-    for name, write in NO_FILE.items():
-        file = tmp_path / f"{name}{suffix}"
-        write(file)
-        with pytest.raises(InvalidInputError, match=rf"`touch` names .*{name}.*(be read|does not exist|no weights)"):
-            open_checkpoint("touch", file)
 
 
 # The folder -----------------------------------------------------------------------------------------------------------

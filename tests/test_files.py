@@ -5,15 +5,9 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from safetensors.torch import load_file
 
-from unitouch_gen.convert import open_checkpoint
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, files_below, read_table, reading, replacing, write_file
-from unitouch_gen.models import UniTouchConfig, UniTouchModel
-from unitouch_gen.models.images import load_images
-from unitouch_gen.models.sounds import load_sounds
-from unitouch_gen.models.videos import read_video
+from unitouch_gen.files import check_writable, files_below, read_table, replacing, write_file
 
 
 def names(folder: Path) -> set[str]:
@@ -64,44 +58,6 @@ def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(t
             write("output", tmp_path / place)
 
 
-def test_whatever_a_library_raises_is_one_error_and_one_that_names_its_argument_stays(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"`model` is .*cannot be loaded: broken$"), reading("model", tmp_path):
-        raise RuntimeError("broken\nmore")
-    with pytest.raises(InvalidInputError, match=r"^`model` is cut off$"), reading("model", tmp_path):
-        raise InvalidInputError("`model` is cut off")
-    with pytest.raises(InvalidInputError, match=r"^`--model` is .*, which cannot be loaded: no file$"):  # noqa: SIM117
-        with reading("--model", tmp_path), reading("pretrained_model_name_or_path", tmp_path):
-            raise OSError("no file")
-
-
-def test_a_git_lfs_pointer_is_named(tmp_path):
-    """As `git clone` leaves one without Git LFS: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md"""
-    digest = "4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393"
-    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{digest}\nsize 12345\n"
-
-    def load_pipeline(weights: Path) -> None:
-        with reading("--model", weights.parents[1]):
-            load_file(weights)
-
-    readers = {
-        "touch.png": lambda file: load_images("touch", file),
-        "touch.npy": lambda file: load_images("touch", file),
-        "hit.wav": lambda file: load_sounds("audio", file),
-        "press.mp4": lambda file: next(read_video("touch", file)),
-        "last.ckpt": lambda file: open_checkpoint("touch", file),
-        "labels.csv": read_table,
-        "model.safetensors": lambda file: UniTouchModel.from_pretrained(file.parent),
-        "unet/diffusion_pytorch_model.safetensors": load_pipeline,
-    }
-    UniTouchConfig().save_pretrained(tmp_path)
-    for name, read in readers.items():
-        file = tmp_path / name
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(pointer)
-        with pytest.raises(InvalidInputError, match=r"is a Git LFS pointer.*; run `git lfs pull` in its repository\."):
-            read(file)
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -114,13 +70,3 @@ def test_a_git_lfs_pointer_is_named(tmp_path):
 def test_tables_are_read_as_spreadsheets_write_them(tmp_path, content, encoding):
     (tmp_path / "list.csv").write_bytes(content.encode(encoding))
     assert read_table(tmp_path / "list.csv") == [{"touch": "a.png", "seed": "1"}]
-
-
-def test_what_is_no_table_is_refused(tmp_path):
-    for content, words in (
-        (b"a,b\n1\n", "other columns in row 1"), (b"a,a\n1,2", "two of one name"), (b"a,b", "no rows"),
-        (b'a\n"b', "is no table: .*line 2"), ("käfer\n1".encode("cp1252"), "save it as UTF-8"),
-    ):  # fmt: skip
-        (tmp_path / "list.csv").write_bytes(content)
-        with pytest.raises(InvalidInputError, match=words):
-            read_table(tmp_path / "list.csv")

@@ -18,7 +18,6 @@ from markdown_it import MarkdownIt
 
 import unitouch_gen.pipelines
 import unitouch_gen.training
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.examples import example, examples
 from unitouch_gen.training.family import STAGES
 
@@ -131,10 +130,6 @@ def test_examples_go_by_what_they_are_of():
         known = examples(modality)
         assert known and all(example(name, modality) == file for name, file in known.items())
     assert {example(name.rpartition("_")[2]) for name in examples()} == set(examples().values())
-    with pytest.raises(InvalidInputError, match=r"`name` is 'brik'.*Did you mean 'brick'"):
-        example("brik")
-    with pytest.raises(InvalidInputError, match="`modality` is 'smell'"):
-        example("brick", "smell")
 
 
 @pytest.mark.skipif(not (CHECKOUT / "unitouch_gen" / "pipelines").is_dir(), reason="there is no clone with links here")

@@ -1,8 +1,10 @@
 """What becomes of files: cut, emptied, replaced by something else, or by what has no end; and odd arguments."""
 
+import io
 import os
 import random
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,6 +51,17 @@ SETTINGS: dict[str, Damage] = {
     "an integer of thousands of digits": lambda file: file.write_text(f'{{"a": {"9" * 5000}}}'),
     "no UTF-8": lambda file: file.write_bytes(b'{"a": "\xff"}'),
 }
+
+
+def encoded(image: Image.Image, kind: str = "png") -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, kind)
+    return stream.getvalue()
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """A chunk of a PNG (W3C, Portable Network Graphics, 5.3)."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 # Of `make soak` -------------------------------------------------------------------------------------------------------

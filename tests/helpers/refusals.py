@@ -17,13 +17,13 @@ def what_came(value: Any) -> str:
 
 
 def check_refusal(
-    call: Callable[[], Any], name: str, *patterns: str, kind: type[Exception] | None = None, given: Any = None
+    call: Callable[[], Any], name: str | None, *patterns: str, kind: type[Exception] | None = None, given: Any = None
 ) -> str:
     """Holds a call to a refusal, and returns its message.
 
     Args:
         call: What has to be refused.
-        name: The argument that the message has to name, alone or among others.
+        name: The argument that the message has to name, alone or among others; `None` if it names a file alone.
         patterns: Regular expressions that the message has to match: a reason, or a way out.
         kind: The error's class; either of the package's two if left out.
         given: The argument's value, which the message has to show if it is a number or a text.
@@ -33,8 +33,9 @@ def check_refusal(
     message = str(caught.value)
     assert kind in (None, type(caught.value)), message
     assert "\n" not in message
-    named = rf"`([\w.]+[,:] )?{re.escape(name)}(\[[^`]*\])?(, \w+)?`"
-    assert re.search(named, message), f"`{name}` is not named: {message}"
+    if name is not None:
+        named = rf"`([\w.]+[,:] )?{re.escape(name)}(\[[^`]*\])?(, \w+)?`"
+        assert re.search(named, message), f"`{name}` is not named: {message}"
     assert what_came(given) in message, f"{given!r} is not shown: {message}"
     for pattern in patterns:
         assert re.search(pattern, message), f"{pattern!r} is not said: {message}"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import SensorBank, SensorMatch
 
 NAMES = ("gelsight", "digit", "taxim")
@@ -38,8 +37,6 @@ def test_retrieval_is_the_smallest_mean_absolute_difference() -> None:
 def test_sensors_without_prototypes_are_named_but_never_retrieved() -> None:
     bank, black = SensorBank(NAMES, 5, 16, 8), torch.zeros(1, 3, 8, 8)
     assert bank.match(black, "digit") == [SensorMatch("digit", None)]
-    with pytest.raises(InvalidInputError, match=r"`sensor` is None.*no prototypes.*gelsight"):
-        bank.match(black)
     bank.set_prototype("taxim", torch.ones(3, 8, 8))
     assert bank.match(black) == [SensorMatch("taxim", 1.0)]  # unset ones are zeros: nearer, but unknown
 
@@ -47,8 +44,6 @@ def test_sensors_without_prototypes_are_named_but_never_retrieved() -> None:
 def test_a_bank_of_none_matches_none() -> None:
     bank = SensorBank((), 5, 16, 8)
     assert bank.match(torch.rand(2, 3, 8, 8)) == [SensorMatch(None, None)] * 2
-    with pytest.raises(InvalidInputError, match="without sensor tokens"):
-        bank.match(torch.rand(2, 3, 8, 8), "digit")
 
 
 def test_an_image_out_of_reach_of_all_is_of_none_unless_the_nearest_is_asked_for() -> None:

@@ -9,11 +9,10 @@ from safetensors.torch import save_file
 from texture_trunk import folded, published_weights
 
 from tests.helpers.components import clip_tokenizer, joint_config
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import denormalise_pixels
 from unitouch_gen.models.texture import TAPPED, TextureTrunk
-from unitouch_gen.training.texture import TRUNK, TextureLosses, TextureObjective, check_takes_texture, read_trunk
+from unitouch_gen.training.texture import TRUNK, read_trunk
 from unitouch_gen.training.touch import LossWeights, TouchEncoder
 
 
@@ -99,10 +98,3 @@ def test_the_trunk_of_a_joint_space_is_read_where_it_has_one(tmp_path: Path) -> 
     torch.testing.assert_close(read(images), trunk.half().float()(images))
     save_file({"touch_model.proj": torch.ones(1)}, tmp_path / "model.safetensors")
     assert read_trunk(tmp_path) is None
-
-
-def test_texture_is_refused_where_it_has_no_place_or_is_there_already() -> None:
-    with pytest.raises(InvalidInputError, match="`joint` has texture already"):
-        check_takes_texture(with_texture())
-    with pytest.raises(InvalidInputError, match="`joint` has a plain CLIP encoder"):
-        check_takes_texture(UniTouchModel(joint_config(clip_tokenizer())))

@@ -8,7 +8,7 @@ import torch
 
 from tests.helpers import recordings
 from tests.helpers.recordings import FIRMEST
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, UnfamiliarInputWarning
+from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.videos import firmest, read_video
 
@@ -111,16 +111,3 @@ def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
 def test_pixels_of_a_video_are_made_square(tmp_path):
     file = recordings.write(tmp_path / "wide.mkv", list(recordings.frames()), pixel_aspect=2)
     assert next(read_video("touch", file)).shape == (48, 128, 3)
-
-
-def test_what_holds_no_contact_is_refused():
-    for images, error, words in (
-        (iter([]), InvalidInputError, "shows no contact"),
-        (iter([np.roll(recordings.rest(), 20 * row, 1) for row in range(12)]), InvalidInputError, "are alike"),
-        (iter([recordings.rest()] * 20), InvalidInputError, "press while it records"),
-        (iter([recordings.rest(), recordings.rest()[:-8]]), InvalidInputError, r"`touch\[1\]` is \(40, 64\) pixels"),
-        (iter([3]), InvalidTypeError, r"`touch\[0\]`"),
-        ("gone.mp4", InvalidInputError, "does not exist"),
-    ):
-        with pytest.raises(error, match=words):
-            firmest("touch", images)

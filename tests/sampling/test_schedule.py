@@ -6,11 +6,9 @@ import torch
 from diffusers import (
     DDIMScheduler,
     DPMSolverMultistepScheduler,
-    FlowMatchEulerDiscreteScheduler,
     UniPCMultistepScheduler,
 )
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.sampling import Guidance
 from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, to_denoised, to_prediction
 
@@ -57,13 +55,6 @@ def test_spacings_are_those_of_diffusers(steps):
         karras.set_timesteps(steps)
         torch.testing.assert_close(torch.tensor(schedule.karras(steps)), karras.sigmas[:-1], rtol=1e-5, atol=0)
     assert schedule.karras(steps)[0] == pytest.approx(schedule.sigma_max)
-
-
-def test_levels_that_do_not_rise_in_float32_or_are_none_are_refused():
-    settings = ({"beta_start": 1e-8}, {"beta_end": 0.999}, {"num_train_timesteps": 1, "trained_betas": [0.9]})
-    for scheduler in (*(DDIMScheduler(**one) for one in settings), FlowMatchEulerDiscreteScheduler()):
-        with pytest.raises(InvalidInputError, match=r"`scheduler` is .*noise levels"):
-            NoiseSchedule.of(scheduler)
 
 
 def test_zero_terminal_snr_has_a_finite_last_level():

@@ -173,7 +173,7 @@ def test_other_settings_of_the_optimiser_hold_after_going_on(tmp_path: Path) -> 
     assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, CONFIG, 20))
 
 
-def test_a_run_that_cannot_go_on_says_why(tmp_path: Path) -> None:
+def test_a_run_that_cannot_go_on_says_why_and_stays_as_it_is(tmp_path: Path) -> None:
     make(tmp_path)[0].fit()
     with pytest.raises(InvalidInputError, match=r"`steps` is 15, but .*step-00000020' is beyond it"):
         make(tmp_path, steps=15)[0].resume()
@@ -181,6 +181,9 @@ def test_a_run_that_cannot_go_on_says_why(tmp_path: Path) -> None:
     objective.trained = nn.Linear(3, 4)
     with pytest.raises(InvalidInputError, match="step-00000020', which does not fit this recipe's model"):
         Trainer(objective, data(), lambda step: [0], CONFIG, tmp_path).resume()
+    trainer, _ = make(tmp_path)
+    trainer.resume()
+    assert trainer.step == 20
 
 
 class Opened:

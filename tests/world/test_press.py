@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from tests.helpers.plain_sensor import PLAIN
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.examples import example
 from unitouch_gen.world import SENSORS, press, untouched_gel
 
@@ -89,63 +88,3 @@ def test_every_sensor_sees_the_coin_with_the_noise_of_its_camera(sensor: str) ->
     assert (one.touch - quiet.touch).std().item() == pytest.approx(SENSORS[sensor].noise, rel=0.1)
     assert torch.equal(one.depth, quiet.depth) and 0.4 < one.depth.max() < 1.5
     assert (quiet.touch[0] - untouched_gel(SENSORS[sensor], 128)).abs().max() > 0.1
-
-
-GOOD = ball(4.0, 10.0)
-BAD_MAPS = [
-    (np.zeros((50, 50)), "is flat; pass a relief"),
-    (np.full((50, 50), 7, np.uint8), "is flat; pass a relief"),
-    (np.where(GOOD > 3.9, np.nan, GOOD), "that are NaN or infinite"),
-    (np.where(GOOD > 3.9, np.inf, GOOD), "that are NaN or infinite"),
-    (np.ones((1, 1)), "is 1 x 1 pixels; pass a map of 8 to 8192"),
-    (np.broadcast_to(np.uint8(3), (10_000, 10_000)), "is 10000 x 10000 pixels; pass a map of 8 to 8192"),
-    (np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8), "is in colours; pass a grey height map"),
-    (np.zeros((9, 9), np.int32), "floats in mm, or uint8 or uint16"),
-    (np.zeros((9, 9), bool), "floats in mm, or uint8 or uint16"),
-    (np.ones(9), r"pass heights \(H, W\)"),
-    ([], "is an empty list; pass at least one"),
-    (None, "is None; pass a path"),
-    (3, "is 3; pass a path"),
-    ("gone.png", "which does not exist; pass the path of a height map"),
-    (GOOD * 1e6, "reaches over"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("height", "said"), BAD_MAPS)
-def test_maps_that_cannot_be_pressed_are_refused(height: object, said: str) -> None:
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`height.*{said}"):
-        press(height)
-
-
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        *(({"mm": value}, "mm") for value in (-1.0, 0.0, None, math.nan, math.inf, "30")),
-        *(({"depth": value}, "depth") for value in (-1.0, 0.0, [], "deep", [1.0, None])),
-        *(({"sensor": value}, "sensor") for value in ("digt", None, 3)),
-        *(({"at": value}, "at") for value in (3, [], [(99.0, 0.0)], [("a", 1.0)], [(1.0,)], [(math.nan, 0.0)])),
-        *(({"relief_mm": value}, "relief_mm") for value in (0.0, -1.0, None)),
-        *(({"image_size": value}, "image_size") for value in (1, 10**6, 64.0)),
-        *(({"seed": value}, "seed") for value in (-1, 0.5)),
-        ({"depth": [1.0, 1.0, 1.0], "at": [(0.0, 0.0), (1.0, 0.0)]}, "at"),
-    ],
-)
-def test_arguments_out_of_range_are_refused_by_name(given: dict, name: str) -> None:
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}`"):
-        press(GOOD, **{"mm": 10.0, **given})
-
-
-def test_files_that_hold_no_map_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "words.png").write_text("no picture")
-    (tmp_path / "map.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(64))
-    np.save(tmp_path / "objects.npy", np.array([{}]), allow_pickle=True)
-    Image.new("L", (10_000, 10_000)).save(tmp_path / "large.png")
-    Image.effect_noise((16, 16), 50).save(tmp_path / "cut.png")
-    whole = (tmp_path / "cut.png").read_bytes()
-    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
-    for name, said in (
-        ("words.png", "cannot be read as an image"), ("map.exr", "save it as a PNG of 8 or 16 bits, a float TIFF"),
-        ("objects.npy", "allow_pickle"), ("large.png", "is 10000 x 10000 pixels"), ("cut.png", "cannot be read"),
-    ):  # fmt: skip
-        with pytest.raises(InvalidInputError, match=f"`height` names '.*{name}'.*{said}"):
-            press(tmp_path / name)

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.helpers.plain_sensor import touch_images
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.world import MATERIAL_NAMES, SCENE_MODALITIES, SENSORS, Scene, World, draw_sensor
+from unitouch_gen.world import MODALITIES, SENSORS, Scene, World, draw_sensor
 from unitouch_gen.world.scene import YIELD, grasp_margin
 from unitouch_gen.world.surfaces import surfaces
 
@@ -86,23 +85,3 @@ def test_a_grasp_holds_by_coulombs_law_and_two_of_three_do() -> None:
     assert torch.equal(grasp_margin(friction, weight, depth, share) > 1.0, friction * force > weight / 2)
     names = torch.arange(17).repeat_interleave(30), torch.arange(30).repeat(17), torch.zeros(510, dtype=torch.int64)
     assert 0.5 < (small(1000).render(*names, modalities=("grasp",)).grasp > 1.0).float().mean() < 0.75
-
-
-BAD_ROWS = [1.7], torch.tensor([1.0]), [True], ["1"], [None], [2**70], 1, [[1]], [-1], [1, 2], [], torch.tensor(1)
-BAD = [
-    *(({label: value}, label) for label in ("material", "object", "contact") for value in BAD_ROWS),
-    ({"material": [len(MATERIAL_NAMES)]}, "material"),
-    *(({"modalities": value}, "modalities") for value in (("smell",), None, (), "imge", [3])),
-    *(({"sensors": value}, "sensors") for value in (("braille",), (), "gelsight", None, 3, [[]])),
-    ({"sensors": (USED[2], replace(USED[2], gain=0.1))}, "sensors"),
-    *(({"seed": value}, "seed") for value in (-1, 1.5, True, "0")),
-    *(({"image_size": value}, "image_size") for value in (0, 64.0, "64", 10**9)),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("given", "named"), BAD)
-def test_bad_arguments_are_refused_by_name(given: dict, named: str) -> None:
-    world = {key: given[key] for key in ("seed", "image_size") if key in given}
-    request = {"material": [1], "object": [1], "contact": [1], **{key: given[key] for key in given.keys() - world}}
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`|`object`"):
-        World(**{"image_size": 32, **world}).render(**request)

@@ -3,13 +3,11 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
 from tests.helpers.plain_sensor import MARKED, PLAIN, touch_images
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import SENSORS, Sensor, draw_sensor, untouched_gel
 from unitouch_gen.world.gel import gel_background, shade_gel
 from unitouch_gen.world.grids import pixel_axis
@@ -110,15 +108,3 @@ def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:
     backgrounds = torch.stack([gel_background(sensor, 16) for sensor in MANY])
     assert backgrounds.std(dim=0).mean() > 0.13  # of five named ones it is 0.133
     assert backgrounds.flatten(2).std(dim=-1).mean() > 0.05
-
-
-def test_bad_arguments_are_refused_by_name() -> None:
-    for named, call, arguments in (
-        ("seed", draw_sensor, (-1, 0)),
-        ("number", draw_sensor, (0, 1.5)),
-        ("near", partial(draw_sensor, near=math.nan), (0, 0)),
-        ("sensor", untouched_gel, ("digit", 64)),
-        ("resolution", untouched_gel, (PLAIN, 0)),
-    ):
-        with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}` is"):
-            call(*arguments)

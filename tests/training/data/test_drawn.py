@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.training.data import Contacts, DataConfig, DrawnConfig, columns_of, sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
@@ -96,10 +95,6 @@ def test_other_sizes_and_sounds_are_rendered_anew(splits, place: Path, processor
     [heard] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     np.testing.assert_allclose(heard.audio, splits[0].audio - 1.0 / before.std, atol=1e-2)
     assert len({small.fingerprint, heard.fingerprint, splits[0].fingerprint}) == 3
-    with pytest.raises(InvalidInputError, match="takes one of the two"):
-        DataConfig(drawn=CONFIG.drawn, sets=[{"path": str(place)}]).sources()
-    with pytest.raises(InvalidInputError, match="`touch_size` is 64; with drawn sensors"):
-        columns_of(SOURCES[:1], place, CONFIG.model_copy(update={"touch_size": 64}), processor, ())
 
 
 def test_scanned_objects_are_those_of_their_split_and_named(place: Path, processor: UniTouchProcessor) -> None:
@@ -119,11 +114,3 @@ def test_scanned_objects_are_those_of_their_split_and_named(place: Path, process
         replace(source, **changes).fingerprint("test") for changes in ({}, {"scanned": 0.0}, {"photographic": 1.0})
     ]
     assert len({*prints}) == 3
-
-
-def test_surfaces_without_heights_are_refused_where_touches_are_needed(
-    place: Path, processor: UniTouchProcessor
-) -> None:
-    config = DataConfig(drawn=DrawnConfig(objects=1, contacts_per_object=1, scanned=1.0, colours_alone=True))
-    with pytest.raises(InvalidInputError, match=r"`data.drawn.colours_alone` is true, but this stage needs touches"):
-        columns_of(config.sources(), place, config, processor, ("image", "touch"))

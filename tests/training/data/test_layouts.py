@@ -1,6 +1,5 @@
-"""Data sets as they are published, and folders of one's own: a small tree in each layout, and broken ones."""
+"""Data sets as they are published, and folders of one's own: a small tree in each layout is recognised and read."""
 
-import shutil
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
@@ -8,24 +7,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers.data_sets import painted, shade, write_attempts, write_image
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from tests.helpers.data_sets import shade
+from tests.helpers.layouts import (
+    ONE,
+    THREE,
+    TWO,
+    feeling_of_success,
+    hct,
+    object_folder,
+    object_folder_real,
+    ssvtp,
+    table,
+    tacquad,
+    touch_and_go,
+    tree,
+    tree_of_objects,
+    tree_of_splits,
+    write,
+    ycb_slide,
+)
 from unitouch_gen.training.data import RecordSet, open_dataset
 from unitouch_gen.training.data.records import Frame
-
-ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
-
-
-def write(folder: Path, files: dict) -> None:
-    """Images of the colours of numbers, and texts; a folder of no content is removed."""
-    for name, content in files.items():
-        if content is None:
-            shutil.rmtree(folder / name)
-        elif isinstance(content, int):
-            write_image(folder / name, shade(content))
-        else:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(content)
 
 
 def number_of(frame: Frame | None) -> int | None:
@@ -45,98 +47,6 @@ def told(data: RecordSet) -> list[str]:
         words = [record.id, *numbers, record.sensor, record.object, record.recording, record.split, *labels]
         lines.append(" ".join("-" if word is None else str(word) for word in words))
     return lines
-
-
-def touch_and_go(folder: Path) -> None:
-    for number, recording in enumerate((ONE, TWO, THREE)):
-        for frame in range(3):
-            write(folder, {f"dataset/{recording}/gelsight_frame/{frame:010d}.jpg": 10 * number + frame,
-                           f"dataset/{recording}/video_frame/{frame:010d}.jpg": 40 + frame})  # fmt: skip
-    first, third = f"{ONE}/0000000000.jpg", f"{TWO}/0000000002.jpg"
-    label = f"{first},3\n{ONE}/0000000001.jpg,-1\n{third}, 7\n{THREE}/0000000001.jpg,19\n"
-    write(folder, {"label.txt": label, "train.txt": f"{first},3\n", "test.txt": f"{third},7\n",
-                   "train_rough.txt": f"{first},1\n", "test_rough.txt": f"{third},-1\n"})  # fmt: skip
-
-
-def feeling_of_success(folder: Path) -> None:
-    """Eleven attempts, so that i10 comes after i9, and one in another file."""
-
-    def attempt(number: int) -> dict:
-        numbers = {"gelsightA_during": number, "gelsightB_during": 20 + number, "kinectA_rgb_during": 40 + number}
-        arrays = {name: painted(shade(at)) for name, at in numbers.items()}
-        arrays |= {f"gelsight{finger}_before": painted(shade(60)) for finger in "AB"}
-        return {"object_name": np.bytes_(f"object_{number}"), "is_gripping": np.bool_(number % 2 == 0), **arrays}
-
-    write_attempts(folder / "calandra_corl2017_000.h5", [attempt(number) for number in range(11)])
-    write_attempts(folder / "calandra_corl2017_001.h5", [attempt(12)])
-
-
-def ycb_slide(folder: Path) -> None:
-    run = "real/035_drill/dataset_0"
-    write(folder, {f"sim/004_box/00/tactile_images/{number}.jpg": number for number in (2, 10)})
-    write(folder, {f"{run}/frames/frame_7.jpg": 1, f"{run}/webcam_frames/frame_7.jpg": 2})
-    write(folder, {f"real/004_box/dataset_1/frames/frame_{number}.jpg": 20 + number for number in (0, 1)})
-
-
-def object_folder(folder: Path) -> None:
-    for number, item in enumerate(("7", "101")):
-        write(folder, {f"touch/{item}/{point}.png": point + 2 * number for point in range(2)})
-        write(folder, {f"vision/{item}/{point}.png": 10 + point + 2 * number for point in range(2)})
-    write(folder, {"label.json": '{"7": 0, "101": 6}', "split.json": '{"train": [["7", 0]], "test": [["101", 1]]}'})
-
-
-def object_folder_real(folder: Path) -> None:
-    write(folder, {f"{item}/tactile_data/3/0/gelsight/{at}.png": at for item, at in (("1", 2), ("1", 10), ("2", 0))})
-    write(folder, {"objects.csv": "ID;Name;Material\n1;Bowl;Wood\n2;Fork;\n"})
-
-
-def ssvtp(folder: Path) -> None:
-    for number in (1, 2, 30):
-        write(folder, {f"images_tac/image_{number}_tac.jpg": number, f"images_rgb/image_{number}_rgb.jpg": 10 + number,
-                       f"text/labels_{number}.txt": f"smooth, number {number}\n"})  # fmt: skip
-    write(folder, {f"{split}.csv": f"url,tactile\nimages_rgb/image_{number}_rgb.jpg,x\n"
-                   for split, number in (("train", 1), ("test", 30))})  # fmt: skip
-
-
-def hct(folder: Path) -> None:
-    rows = ["url,tactile,tactile_background,caption"]
-    for session in ("one", "two"):
-        write(folder, {f"data1/{session}/background/0.jpg": 0})
-        for number in range(3):
-            write(folder, {f"data1/{session}/tactile/{number}-0.5.jpg": 1 + number % 2,
-                           f"data1/{session}/vision/{number}-0.5.jpg": 63 - number})  # fmt: skip
-            picture, touch = (f"{session}/{place}/{number}-0.5.jpg" for place in ("vision", "tactile"))
-            rows.append(f'{picture},{touch},{session}/background/0.jpg,"soft, {number}"')
-    write(folder, {"data1/train.csv": "\n".join(rows)})
-
-
-def tacquad(folder: Path) -> None:
-    for sensor, touches, pictures in (("gelsight", 12, 6), ("digit", 2, 4), ("duragel", 6, 0)):
-        write(folder, {f"data_indoor/mug/{sensor}/{number}.png": number for number in range(touches)})
-        write(folder, {f"data_indoor/mug/img_{sensor}/{number}.png": 20 + number for number in range(pictures)})
-    write(folder, {"contact_indoor.csv": "mug,10,11,0,1,3,3\n"})
-
-
-def table(folder: Path) -> None:
-    rows = ("touch,picture,background,sensor,material,object,caption,split,hardness",
-            'a.png,b.png,c.png,digit,wood,one,"rough, and hard",train,2',
-            "b.png,,c.png,gelsight,glass,two,smooth,test,-1", "c.png,b.png,,digit,,three,,train,10")  # fmt: skip
-    write(folder, {"a.png": 0, "b.png": 1, "c.png": 2, "labels.csv": "\n".join(rows)})
-
-
-def tree(folder: Path) -> None:
-    write(folder, {"touch/wood/2.png": 2, "touch/wood/10.png": 10, "touch/wood/background.png": 40, "touch/11.png": 11,
-                   "picture/wood/2.jpg": 20, "picture/wood/10.png": 30, "background/wood/2.bmp": 41})  # fmt: skip
-
-
-def tree_of_splits(folder: Path) -> None:
-    write(folder, {"train/wood/1.png": 0, "train/glass/1.PNG": 1, "test/wood/1.png": 2, "test/wood/.hidden.png": 3})
-
-
-def tree_of_objects(folder: Path) -> None:
-    write(
-        folder, {"Train/wood/plank/1.png": 1, "Train/wood/2.png": 2, "VALID/glass/jar/3.png": 3, "test/glass/4.png": 4}
-    )
 
 
 LAYOUTS: dict[Callable, tuple[int, str]] = {
@@ -216,12 +126,6 @@ def test_a_table_names_files_however_their_letters_are_composed(tmp_path: Path) 
     assert number_of(open_dataset(tmp_path).records[0].touch) == 5
 
 
-def test_a_folder_in_which_no_touch_is_where_one_is_expected_says_where(tmp_path: Path) -> None:
-    write(tmp_path, {"a/b/c/d/1.png": 1})
-    with pytest.raises(InvalidInputError, match=r"it has no touches where they are expected: MATERIAL/x\.png"):
-        open_dataset(tmp_path)
-
-
 def test_integers_that_pandas_has_made_floats_are_labels_by_number(tmp_path: Path) -> None:
     """Of a column of integers with blanks; -1 and nan are no labels."""
     rows = ("touch,material", "a.png,2.0", "b.png,-1.0", "c.png,nan", "d.png,0.0", "e.png,")
@@ -246,43 +150,3 @@ def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
     assert data.classes["material"] == tuple(names) and {record.sensor for record in data.records} == {"mine"}
     (tmp_path / "split.json").unlink()
     assert len(open_dataset(tmp_path)) == 4  # without a split all points are there
-
-
-BROKEN = [
-    (touch_and_go, {f"dataset/{ONE}/gelsight_frame": None}, r"1 of 6 files are not there: .*gelsight_frame/0+\.jpg"),
-    (touch_and_go, {f"dataset/{name}/gelsight_frame": None for name in (ONE, TWO, THREE)}, r"run .* extract_frame\.py"),
-    (ycb_slide, {"real/004_box/dataset_1/frames": None}, r"has no images; .* run: .*ffmpeg"),
-    (touch_and_go, {"test.txt": f"{ONE}/0000000000.jpg,3\n"}, r"train.txt and test.txt both list .*00\.jpg"),
-    (touch_and_go, {"label.txt": f"{ONE}/0.jpg;3\n"}, r"label\.txt' has '.*;3'; a line is recording/frame"),
-    (feeling_of_success, {"calandra_corl2017_001.h5": "gone"}, r"_001\.h5' is no list of attempts"),
-    (object_folder, {"label.json": '{"7": "wood", "101": 7}'}, "no label from 0 to 6 for the objects 101; 7"),
-    (object_folder, {"split.json": '{"train": [["7", 0]], "test": [["7", 0]]}'}, "several records of one id: 7/0"),
-    (ssvtp, {"test.csv": "url\nimages_rgb/image_1_rgb.jpg\n"}, r"image_1_rgb\.jpg', which is in another split"),
-    (tacquad, {"contact_indoor.csv": "mug,2,12,0,1,3,3"}, "has 12 images, but contact from 2 to 12"),
-    (table, {"labels.csv": "tuoch,material\na.png,wood\n"}, r"columns \['tuoch', 'material'\], and none of touch"),
-    (table, {"labels.csv": "touch,split\na.png,training\n"}, "has the split 'training'"),
-    (table, {"more.csv": ""}, r"2 tables, labels\.csv; more\.csv; leave one"),
-]
-
-
-@pytest.mark.parametrize(("make", "damage", "message"), BROKEN)
-def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_path: Path) -> None:
-    make(tmp_path)
-    write(tmp_path, damage)
-    with pytest.raises(InvalidInputError, match=f"`path` is .*, read as .*{message}"):
-        open_dataset(tmp_path)
-
-
-def test_arguments_that_cannot_be_meant_are_refused(tmp_path: Path, monkeypatch) -> None:
-    table(tmp_path)
-    write(tmp_path, {"two/images_tac/image_1_tac.jpg": 1, "two/label.json": "{}"})
-    monkeypatch.chdir(tmp_path)
-    for arguments, message in (
-        ({"path": "nowhere"}, "`path` is 'nowhere', which is not there"),
-        ({"path": "labels.csv"}, "which is no folder; unpack it"),
-        ({"path": "two"}, "looks like object_folder and ssvtp; say its `kind`"),
-        ({"kind": "touch_and_goo"}, "`kind` is 'touch_and_goo'.*Did you mean 'touch_and_go'"),
-        *(({name: 3}, f"`{name}` is 3") for name in ("path", "sensor", "materials")),
-    ):
-        with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
-            open_dataset(**{"path": tmp_path, **arguments})
