@@ -62,7 +62,8 @@ def share_pipelines(threads: int, calls: int) -> None:
         return pipes[name](**{"num_inference_steps": 3, **given}, generator=seeded(), output_type="np").images
 
     shared, alone = ({name: quiet(unitouch_gen.tiny(name)) for name, _ in CALLS} for _ in range(2))
-    expected, order = [picture(alone, number) for number in range(len(CALLS))], [*range(len(CALLS))] * calls
+    expected = [picture(alone, number) for number in range(len(CALLS))]
+    order = [*range(len(CALLS))] * calls
     with ThreadPoolExecutor(threads) as pool:
         for number, made in zip(order, pool.map(lambda number: picture(shared, number), order), strict=True):
             if abs(made - expected[number]).max() > 1e-5:
@@ -111,7 +112,9 @@ def what_others_have_there(folder: Path) -> Iterator[None]:
 
 def kill_saves(here: Path, kills: int) -> None:
     """Of a pipeline that is saved over another one, the old or the new one is there."""
-    whole, begun, folder = [], time.monotonic(), here / "there"
+    whole = []
+    begun = time.monotonic()
+    folder = here / "there"
     for number in (1, 2, 1):
         child = finished(Child(save_numbered, str(folder), number, folder=here))
         whole.append(seen(folder))
@@ -133,9 +136,11 @@ def kill_saves(here: Path, kills: int) -> None:
 def kill_batches(here: Path, model: str, kills: int) -> None:
     """A batch goes on where it was killed: each picture is there whole or not at all, and in the end all are."""
     (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/a.png,{seed}\n" for seed in range(6)))
-    words, begun = ["batch", "table.csv", "--batch-size", "2", "--model", model, "-o"], time.monotonic()
+    words = ["batch", "table.csv", "--batch-size", "2", "--model", model, "-o"]
+    begun = time.monotonic()
     child = finished(Child(command, *words, "whole", folder=here))
-    limits, whole = {"changes": child.changes, "seconds": time.monotonic() - begun}, seen(here / "whole", "*.png")
+    limits = {"changes": child.changes, "seconds": time.monotonic() - begun}
+    whole = seen(here / "whole", "*.png")
     for count in range(kills):
         out = f"out{count // 3}"
         how = killed(command, *words, out, folder=here, **limits)
@@ -173,7 +178,8 @@ def read_damaged_files(here: Path, pipes: dict[str, Any], count: int) -> None:
     whole = whole_files(here)
     for number in range(count):
         name = DRAW.choice(list(whole))
-        content, file = bytearray(whole[name]), here / f"{number}.{name}"
+        content = bytearray(whole[name])
+        file = here / f"{number}.{name}"
         places = [DRAW.randrange(min(DRAW.choice([64, 10**9]), len(content))) for _ in range(DRAW.randint(1, 12))]
         for place in places:
             content[place] ^= 1 << DRAW.randrange(8)
@@ -193,7 +199,8 @@ FREE = ("throw", "bridge", "output_type", "generator", "cross_attention", "callb
 
 def pass_odd_arguments(pipes: dict[str, Any], count: int) -> None:
     """Each is refused, or changes the picture, which is finite."""
-    touch, photo = {"touch": torch.rand(1, 3, 32, 32)}, {"image": torch.rand(1, 3, 32, 32)}
+    touch = {"touch": torch.rand(1, 3, 32, 32)}
+    photo = {"image": torch.rand(1, 3, 32, 32)}
     for kind, base in {"touch-to-image": touch, "stylize": {**photo, **touch}, "x-to-touch": photo}.items():
         known = {*inspect.signature(type(pipes[kind]).__call__).parameters} - {"self", "return_dict"}
         expected = pipes[kind](**base, output_type="latent", generator=seeded()).images
@@ -216,11 +223,16 @@ def pass_odd_arguments(pipes: dict[str, Any], count: int) -> None:
 
 
 COMMANDS = {
-    "touch-to-image": "in/a.png -o out", "stylize": "in/a.png in/a.png -o out", "x-to-touch": "--text brick -o out",
-    "batch": "table.csv -o out", "classify": "in/a.png --labels wood,glass",
-    "convert unitouch": "--touch in/a.png -o out", "data check": "in", "stability": "--only none",
+    "touch-to-image": "in/a.png -o out",
+    "stylize": "in/a.png in/a.png -o out",
+    "x-to-touch": "--text brick -o out",
+    "batch": "table.csv -o out",
+    "classify": "in/a.png --labels wood,glass",
+    "convert unitouch": "--touch in/a.png -o out",
+    "data check": "in",
+    "stability": "--only none",
     "distill": "--model in -o out",
-}  # fmt: skip
+}
 
 
 class Ran(BaseException):
@@ -235,7 +247,8 @@ def run_odd_commands(models: dict[str, str], count: int) -> None:
 
     torch.nn.Module.__call__ = stop  # type: ignore[method-assign]
     for _ in range(count):
-        name, known = DRAW.choice(list(COMMANDS)), typer.main.get_command(cli.commands)
+        name = DRAW.choice(list(COMMANDS))
+        known = typer.main.get_command(cli.commands)
         for word in name.split():
             known = known.commands[word]  # type: ignore[attr-defined]
         given = COMMANDS[name].split() + (["--model", models[name]] if name in models else [])

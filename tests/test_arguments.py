@@ -28,4 +28,5 @@ def test_defaults_of_calls_are_those_of_the_arguments():
     ]
     for name, field in SamplingArguments.model_fields.items():
         defaults = {call[name].default for call in calls if name in call}
-        assert defaults and defaults <= {field.default, None}
+        assert defaults
+        assert defaults <= {field.default, None}

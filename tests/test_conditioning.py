@@ -25,7 +25,8 @@ def test_every_embedding_gets_the_norm_and_keeps_its_direction_and_zero_stays_ze
 
 
 def test_noising_each_at_its_own_level_is_that_of_diffusers():
-    pipe, levels = diffusers_pipeline(make_components()), torch.tensor([0, 1, 250, 500, 999])
+    pipe = diffusers_pipeline(make_components())
+    levels = torch.tensor([0, 1, 250, 500, 999])
     found = noise_embeddings(EMBEDS, levels, NOISE, pipe.image_normalizer, pipe.image_noising_scheduler)
     each = [pipe.noise_image_embeddings(EMBEDS, noise_level=level, noise=NOISE) for level in levels.tolist()]
     expected = torch.stack([labels[row] for row, labels in enumerate(each)])
@@ -36,7 +37,8 @@ def test_noising_each_at_its_own_level_is_that_of_diffusers():
 def test_signal_and_noise_have_the_shares_of_the_schedule(level, signal, sigma):
     """With a plain normaliser c = sqrt(abar) e + sqrt(1 - abar) n; the shares are those of SD 2.1 unCLIP."""
     plain = StableUnCLIPImageNormalizer(embedding_dim=D).requires_grad_(False)
-    scheduler, unit = DDPMScheduler(beta_schedule="squaredcos_cap_v2"), EMBEDS / 5.0
+    scheduler = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
+    unit = EMBEDS / 5.0
     for dtype in (torch.float16, torch.bfloat16, torch.float64, torch.float32):
         inputs = (unit.to(dtype), torch.full((5,), level), NOISE.to(dtype), plain, scheduler)
         found = noise_embeddings(*inputs)

@@ -71,7 +71,9 @@ def test_one_file_brings_its_encoders_alone_in_the_dtype_asked_for(files, tmp_pa
 
 
 def test_files_of_another_network_change_nothing(tmp_path):
-    state, head, bias = ImageBind(sizes(), ("touch",)).state_dict(), "heads.touch.2.weight", "blocks.0.attn.bias_k"
+    state = ImageBind(sizes(), ("touch",)).state_dict()
+    head = "heads.touch.2.weight"
+    bias = "blocks.0.attn.bias_k"
     weight = state[f"modality_{head}"]
     for key, value, words in (
         (head, torch.full_like(weight, math.nan), f"{head}` holds .* values that are NaN"),
@@ -126,12 +128,14 @@ def test_state_dicts_of_all_formats_are_read(tmp_path):
     for name, write in SAVED.items():
         write(tmp_path / name)
         tensors = open_checkpoint("touch", tmp_path / name)
-        assert set(tensors) == set(WEIGHTS) and all(torch.equal(tensors[key], WEIGHTS[key]) for key in WEIGHTS), name
+        assert set(tensors) == set(WEIGHTS), name
+        assert all(torch.equal(tensors[key], WEIGHTS[key]) for key in WEIGHTS), name
     assert "pytorch_lightning" not in sys.modules
 
 
 def test_code_in_a_pickle_is_not_run(tmp_path):
-    trap, names = tmp_path / "trap", ("archive.pth", "legacy.pth", "bare.pth")
+    trap = tmp_path / "trap"
+    names = ("archive.pth", "legacy.pth", "bare.pth")
     archive, legacy, bare = (tmp_path / name for name in names)
     torch.save({"state_dict": WEIGHTS, "more": Runs(trap)}, archive)
     torch.save({"state_dict": WEIGHTS, "more": Runs(trap)}, legacy, _use_new_zipfile_serialization=False)
@@ -150,7 +154,8 @@ def test_the_processor_of_the_folder_fits_its_model(model, folder):
     processor = UniTouchProcessor.from_pretrained(folder)
     assert processor.text("rough brick")["attention_mask"].sum() == 4  # whole words between start and end
     sound = torch.randn(16_000, generator=torch.Generator().manual_seed(0)).numpy()
-    assert processor.image_size == 32 and model.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 16)
+    assert processor.image_size == 32
+    assert model.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 16)
 
 
 @pytest.mark.parametrize("there", ["a model", "a pipeline", "a file"])

@@ -37,7 +37,8 @@ def test_logits_and_greedy_text_are_those_of_the_release(tmp_path, legacy):
     assert_close(found, wanted, atol=1e-5 * float(wanted.abs().max()), rtol=0)
     wanted[..., 2] = -torch.inf  # </s>
     assert torch.equal(made[:, ids.shape[1] :], wanted[:, ids.shape[1] - 1 : -1].argmax(dim=-1))
-    assert pipe.language_model.generation_config.temperature == 0.1 and "### Response:" in pipe.config.prompt_template
+    assert pipe.language_model.generation_config.temperature == 0.1
+    assert "### Response:" in pipe.config.prompt_template
     pipe.register_to_config(prompt_template="{question}")
     texts = pipe(touch_embeds=EMBEDS, question="How?", **options).texts
     assert texts == [TOKENIZER.decode(row[ids.shape[1] :], skip_special_tokens=True).strip() for row in made]

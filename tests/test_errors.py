@@ -24,7 +24,8 @@ def test_what_is_on_the_edge_passes_as_a_plain_number():
         (number, Fraction(3, 4), 0.75),
     ):
         checked = check(value)
-        assert checked == expected and type(checked) is type(expected)
+        assert checked == expected
+        assert type(checked) is type(expected)
 
 
 def test_tensors_that_fit_pass_as_they_are():
@@ -49,7 +50,10 @@ def test_a_mistake_is_one_line_and_exit_code_2(error, capsys):
         errors.run_commands(app, "unitouch-gen", [])
     assert ended.value.code == 2
     out, err = capsys.readouterr()
-    assert not out and err.count("\n") == 1 and err.startswith("unitouch-gen: ") and "a b" in err
+    assert not out
+    assert err.count("\n") == 1
+    assert err.startswith("unitouch-gen: ")
+    assert "a b" in err
 
 
 def test_a_working_folder_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys):

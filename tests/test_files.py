@@ -18,8 +18,10 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
     file = write_file("output", tmp_path / "new" / "a.txt", "old")
     with replacing("output", file) as partial:
         partial.write_text("new")
-        assert file.read_text() == "old" and partial.name == "a.txt"
-    assert file.read_text() == "new" and names(tmp_path) == {"new/a.txt"}
+        assert file.read_text() == "old"
+        assert partial.name == "a.txt"
+    assert file.read_text() == "new"
+    assert names(tmp_path) == {"new/a.txt"}
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -27,7 +29,8 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     with pytest.raises(RuntimeError), replacing("output", file) as partial:  # noqa: PT012
         partial.write_text("half")
         raise RuntimeError
-    assert file.read_text() == "old" and names(tmp_path) == {"a.txt"}
+    assert file.read_text() == "old"
+    assert names(tmp_path) == {"a.txt"}
 
 
 def test_files_below_are_listed_once_by_their_own_names_whatever_links_lead_back(tmp_path):
@@ -45,7 +48,8 @@ def test_a_link_stays_one(tmp_path):
     file = write_file("output", tmp_path / "a.txt", "old")
     (tmp_path / "link").symlink_to(file)
     write_file("output", tmp_path / "link", "new")
-    assert (tmp_path / "link").is_symlink() and file.read_text() == "new"
+    assert (tmp_path / "link").is_symlink()
+    assert file.read_text() == "new"
 
 
 def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(tmp_path):
@@ -61,11 +65,16 @@ def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(t
 @pytest.mark.parametrize(
     "content",
     [
-        "Touch,Seed\na.png,1\n\n", "touch;seed\r\na.png;1\r\n", "touch\tseed\ra.png\t1\r", "sep=;\ntouch;seed\na.png;1",
-        "touch,seed,,\na.png,1,,\n,,,", '"sep=|"\ntouch|seed\n"a.png"|1', "\n touch , seed\na.png, 1",
+        "Touch,Seed\na.png,1\n\n",
+        "touch;seed\r\na.png;1\r\n",
+        "touch\tseed\ra.png\t1\r",
+        "sep=;\ntouch;seed\na.png;1",
+        "touch,seed,,\na.png,1,,\n,,,",
+        '"sep=|"\ntouch|seed\n"a.png"|1',
+        "\n touch , seed\na.png, 1",
         ",touch,seed\n0,a.png,1",
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_tables_are_read_as_spreadsheets_write_them(tmp_path, content, encoding):
     (tmp_path / "list.csv").write_bytes(content.encode(encoding))

@@ -79,8 +79,10 @@ def targets(text: str) -> list[str]:
 def test_nothing_is_relative_in_what_an_index_shows():
     about = metadata("unitouch_gen")
     text = about["Description"] or about.get_payload()
-    assert "## Anything to touch" in text and about["Description-Content-Type"] == "text/markdown"
-    assert targets(text) and all(re.match("https?://", target) for target in targets(text))
+    assert "## Anything to touch" in text
+    assert about["Description-Content-Type"] == "text/markdown"
+    assert targets(text)
+    assert all(re.match("https?://", target) for target in targets(text))
 
 
 without_setup = pytest.mark.skipif(not (CHECKOUT / "setup.py").is_file(), reason="there is no checkout here")
@@ -90,7 +92,8 @@ without_setup = pytest.mark.skipif(not (CHECKOUT / "setup.py").is_file(), reason
 def test_the_readme_becomes_one_without_files_beside_it():
     """All that it links to, at the repository's address, or what has an address anyway."""
     described = runpy.run_path(str(CHECKOUT / "setup.py"))["described"]
-    text, url = (CHECKOUT / "README.md").read_text(), "https://host.example/owner/unitouch_gen"
+    text = (CHECKOUT / "README.md").read_text()
+    url = "https://host.example/owner/unitouch_gen"
     absolute = [target for target in targets(text) if re.match("https?://", target)]
     expected = [
         target
@@ -98,28 +101,41 @@ def test_the_readme_becomes_one_without_files_beside_it():
         else f"{url}/{'raw' if target.endswith(('.png', '.jpg')) else 'blob'}/HEAD/{target}"
         for target in targets(text)
     ]
-    assert targets(described(text, url)) == expected and targets(described(text, "")) == absolute
+    assert targets(described(text, url)) == expected
+    assert targets(described(text, "")) == absolute
 
 
 @without_setup
 def test_an_address_that_is_none_is_refused():
     done = subprocess.run(
-        [sys.executable, CHECKOUT / "setup.py", "--version"], env={**os.environ, "UNITOUCH_GEN_URL": "host/owner"},
-        capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
-    assert done.returncode and "UNITOUCH_GEN_URL is 'host/owner'" in done.stderr
+        [sys.executable, CHECKOUT / "setup.py", "--version"],
+        env={**os.environ, "UNITOUCH_GEN_URL": "host/owner"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode
+    assert "UNITOUCH_GEN_URL is 'host/owner'" in done.stderr
 
 
 def test_data_files_are_installed():
     for name in (
-        "py.typed", "examples/gelsight_brick.png", "examples/photos/wood.png", "examples/sounds/metal.wav",
+        "py.typed",
+        "examples/gelsight_brick.png",
+        "examples/photos/wood.png",
+        "examples/sounds/metal.wav",
         "examples/heights/coin.png",
-        "weights/cards/stylization.jpg", "weights/family.json",
-        "weights/joint/model.safetensors", "weights/joint/tokenizer.json",
-        "weights/touch-classifier/model.safetensors", "world/calibrated_sensors.json",
-        "world/collection/index.csv", "world/collection/sounds/wood__default_dig_choppy_1.flac",
+        "weights/cards/stylization.jpg",
+        "weights/family.json",
+        "weights/joint/model.safetensors",
+        "weights/joint/tokenizer.json",
+        "weights/touch-classifier/model.safetensors",
+        "world/calibrated_sensors.json",
+        "world/collection/index.csv",
+        "world/collection/sounds/wood__default_dig_choppy_1.flac",
         "world/collection/surfaces/wood__polyhaven_worn_planks.height.webp",
-    ):  # fmt: skip
+    ):
         assert files("unitouch_gen").joinpath(name).is_file(), name
     assert files("unitouch_gen.training").joinpath("recipes/touch.yaml").is_file()
 
@@ -128,7 +144,8 @@ def test_examples_go_by_what_they_are_of():
     """And no two touches are of one material, or one would hide the other."""
     for modality in ("touch", "image", "audio", "height"):
         known = examples(modality)
-        assert known and all(example(name, modality) == file for name, file in known.items())
+        assert known
+        assert all(example(name, modality) == file for name, file in known.items())
     assert {example(name.rpartition("_")[2]) for name in examples()} == set(examples().values())
 
 
@@ -201,7 +218,8 @@ def test_threads_of_training_wait_passively_unless_the_user_said_otherwise(own, 
 
 
 def test_built_in_pipelines_run():
-    touch, photo = unitouch_gen.example("brick"), unitouch_gen.example("wood", "image")
+    touch = unitouch_gen.example("brick")
+    photo = unitouch_gen.example("wood", "image")
     for name, inputs in {
         "touch-to-image": {"touch": touch},
         "x-to-touch": {"text": "rough brick"},
@@ -210,4 +228,5 @@ def test_built_in_pipelines_run():
         pipe = unitouch_gen.tiny(name)
         pipe.set_progress_bar_config(disable=True)
         output = pipe(**inputs, num_inference_steps=2)
-        assert output.images[0].size == (128, 128) and output.report.success
+        assert output.images[0].size == (128, 128)
+        assert output.report.success

@@ -10,7 +10,8 @@ from tests.helpers.processes import Child, finished, script
 from unitouch_gen.solvers import SOLVERS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
-README, CONTRIBUTING = CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md"
+README = CHECKOUT / "README.md"
+CONTRIBUTING = CHECKOUT / "CONTRIBUTING.md"
 PAGES = [README, *sorted((CHECKOUT / "docs").glob("*.md"))]
 pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkout here")
 
@@ -38,14 +39,16 @@ def test_modules_in_commands_exist():
 def test_each_solver_has_a_row_and_is_in_the_reference():
     table, reference = ((CHECKOUT / "docs" / name).read_text() for name in ("error_and_time.md", "reference.md"))
     for name, solver in SOLVERS.items():
-        assert f"\n| `{name}` | {solver.order} |" in table and solver.sample.__name__ in reference, name
+        assert f"\n| `{name}` | {solver.order} |" in table, name
+        assert solver.sample.__name__ in reference, name
 
 
 def test_each_layout_of_data_sets_has_a_row():
     rows = re.findall(r"^\| `(\w+)` \|", (CHECKOUT / "docs" / "training.md").read_text(), re.M)
     modules = (CHECKOUT / "training" / "data").glob("*.py")
     layouts = {file.stem for file in modules if re.search("^LOOKS_LIKE", file.read_text(), re.M)}
-    assert layouts and layouts <= set(rows)
+    assert layouts
+    assert layouts <= set(rows)
 
 
 def test_figures_of_the_readme_are_quoted_from_the_pages():

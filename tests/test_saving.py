@@ -42,7 +42,8 @@ def test_a_save_that_fails_leaves_the_old_folder_and_nothing_else(tmp_path):
 
 def test_a_folder_that_is_filled_keeps_everything_else(tmp_path, monkeypatch):
     """The folder itself, its mode, links and empty folders in it, and files of others; also as the working folder."""
-    folder, elsewhere = tmp_path / "model", tmp_path / "elsewhere"
+    folder = tmp_path / "model"
+    elsewhere = tmp_path / "elsewhere"
     write_file("x", folder / "mine.txt", "mine")
     write_file("x", elsewhere / "a.txt", "theirs")
     (folder / ".git" / "refs").mkdir(parents=True)
@@ -53,11 +54,15 @@ def test_a_folder_that_is_filled_keeps_everything_else(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     fill(Path())
     assert (folder.stat().st_ino, folder.stat().st_mode) == (before.st_ino, before.st_mode)
-    assert Path.cwd() == folder and (folder / ".git" / "refs").is_dir() and (folder / "part").is_symlink()
+    assert Path.cwd() == folder
+    assert (folder / ".git" / "refs").is_dir()
+    assert (folder / "part").is_symlink()
     assert (folder / "mine.txt").read_text() == "mine"
     # What a link points to is not written through; a folder behind one is the user's way to say where files go.
-    assert (elsewhere / "a.txt").read_text() == "theirs" and (folder / "a.txt").read_text() == "new"
-    assert names(folder) == {"mine.txt", "a.txt"} and names(elsewhere) == {"a.txt", "b.json"}
+    assert (elsewhere / "a.txt").read_text() == "theirs"
+    assert (folder / "a.txt").read_text() == "new"
+    assert names(folder) == {"mine.txt", "a.txt"}
+    assert names(elsewhere) == {"a.txt", "b.json"}
 
 
 def test_files_get_the_mode_that_new_files_get_there(tmp_path):
@@ -80,7 +85,8 @@ def test_files_get_the_mode_that_new_files_get_there(tmp_path):
 @pytest.fixture
 def mounted(tmp_path):
     """A folder of the machine that is mounted inside a model's folder, and that folder."""
-    host, inside = tmp_path / "host", tmp_path / "model" / "part"
+    host = tmp_path / "host"
+    inside = tmp_path / "model" / "part"
     write_file("x", host / "precious.txt", "theirs")
     inside.mkdir(parents=True)
     if shutil.which("mount") is None or subprocess.run(["mount", "--bind", host, inside], check=False).returncode:
@@ -92,11 +98,15 @@ def mounted(tmp_path):
 def test_a_mounted_folder_keeps_its_files_and_may_be_written_to(mounted):
     host, inside = mounted
     fill(inside.parent)
-    assert names(host) == {"precious.txt", "b.json"} and names(inside.parent) == {
-        "a.txt", "part/precious.txt", "part/b.json",
-    }  # fmt: skip
+    assert names(host) == {"precious.txt", "b.json"}
+    assert names(inside.parent) == {
+        "a.txt",
+        "part/precious.txt",
+        "part/b.json",
+    }
     fill(inside)  # a mount by itself, which no rename can replace
-    assert (host / "a.txt").read_text() == "new" and (host / "precious.txt").read_text() == "theirs"
+    assert (host / "a.txt").read_text() == "new"
+    assert (host / "precious.txt").read_text() == "theirs"
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_changes(tmp_path):
@@ -133,8 +143,10 @@ def test_a_killed_save_leaves_the_old_files_or_the_new_ones(tmp_path):
                     pass
             else:
                 fill(folder, "newer", parts=["c.txt"])
-        one, other = (folder / "a.txt").read_text(), (folder / "part" / "b.json").read_text()
-        assert one == other and not is_unfinished(folder)
+        one = (folder / "a.txt").read_text()
+        other = (folder / "part" / "b.json").read_text()
+        assert one == other
+        assert not is_unfinished(folder)
         states.add(one)
         fill(folder, "old")
     assert states == {"old", "unfinished", "new"}
@@ -161,7 +173,8 @@ def test_two_components_in_one_folder_are_refused_before_anything_changes(tmp_pa
     (tmp_path / "other").symlink_to("one")
     with pytest.raises(InvalidInputError, match=r"link to another component's folder. Nothing was changed"):
         fill(tmp_path, parts=["one/a.txt", "other/a.txt"])
-    assert names(tmp_path / "one") == {"a.txt"} and (tmp_path / "one" / "a.txt").read_text() == "old"
+    assert names(tmp_path / "one") == {"a.txt"}
+    assert (tmp_path / "one" / "a.txt").read_text() == "old"
 
 
 def test_a_reader_beside_a_save_reads_one_of_two_models(tmp_path):
@@ -185,5 +198,7 @@ def test_of_two_saves_at_once_one_is_there(tmp_path):
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(fill_again, ("one", "two")))
-    one, other = (tmp_path / "model" / "a.txt").read_text(), (tmp_path / "model" / "part" / "b.json").read_text()
-    assert one == other and names(tmp_path / "model") == {"a.txt", "part/b.json"}
+    one = (tmp_path / "model" / "a.txt").read_text()
+    other = (tmp_path / "model" / "part" / "b.json").read_text()
+    assert one == other
+    assert names(tmp_path / "model") == {"a.txt", "part/b.json"}

@@ -32,7 +32,8 @@ from unitouch_gen.files import write_file
 
 def speed_figures() -> Figures:
     """Seconds for one picture with default settings, after loading."""
-    pipe, touch = quiet("touch-to-image"), example("brick")
+    pipe = quiet("touch-to-image")
+    touch = example("brick")
     calls = {"picture": lambda: seconds_of(pipe, touch, generator=torch.Generator().manual_seed(0))}
     return {"seconds_per_picture": min(in_turns(calls, 3)["picture"])}
 
@@ -68,7 +69,8 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
     torch.set_num_threads(1)  # as calls of small pipelines set it, or what is timed beside them would take more
-    family, console = json.loads(weights.FIGURES.read_text()), Console(width=110)
+    family = json.loads(weights.FIGURES.read_text())
+    console = Console(width=110)
     figures = family["figures"]
     for name, measure in PARTS.items():
         if given.only is not None and name not in given.only:

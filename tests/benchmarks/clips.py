@@ -53,7 +53,8 @@ class Clips:
         """Balanced accuracy of each property by ridge probes of labelled clips, and of plain statistics of these."""
         rows = self.labelled
         differences = [self.peaks[row] - self.gels[row] for row in np.flatnonzero(rows)]
-        truth, objects = {name: values[rows] for name, values in self.truth.items()}, self.objects[rows]
+        truth = {name: values[rows] for name, values in self.truth.items()}
+        objects = self.objects[rows]
         found = {**features, "statistics": statistics(differences)}
         return {name: object_probes(values, truth, objects) for name, values in found.items()}
 
@@ -74,7 +75,9 @@ def object_probes(features: np.ndarray, truth: Mapping[str, np.ndarray], objects
             for name, (true, found) in pairs.items()
         }
 
-    found, rng, names = shares(np.arange(len(objects))), np.random.default_rng(0), np.unique(objects)
+    found = shares(np.arange(len(objects)))
+    rng = np.random.default_rng(0)
+    names = np.unique(objects)
     rows_of = {name: np.flatnonzero(objects == name) for name in names}
     draws = [np.concatenate([rows_of[name] for name in rng.choice(names, len(names))]) for _ in range(200)]
     means = [np.mean(list(shares(rows).values())) for rows in draws]

@@ -69,7 +69,8 @@ def turbo_figures(batches: Sequence[int] = (1, 32), repeats: int = 3) -> Figures
     diffusers' DDIM in 50 steps at guidance 9, and over the default call."""
     figures: Figures = {}
     for name, of in TURBO.items():
-        usual, turbo = quiet(of), quiet(name)
+        usual = quiet(of)
+        turbo = quiet(name)
         ddim = usual_way(usual)
         for size in batches:
             inputs = world_inputs(("touch",) if of == "touch-to-image" else ("image",), size)

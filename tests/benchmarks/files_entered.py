@@ -16,7 +16,8 @@ PACKAGE = Path(unitouch_gen.__file__).parent
 
 def functions_entered() -> dict[str, set[str]]:
     """Qualified names of our functions that the call enters, by file, relative to the package."""
-    pipe, entered = unitouch_gen.tiny("touch-to-image"), defaultdict[str, set[str]](set)
+    pipe = unitouch_gen.tiny("touch-to-image")
+    entered = defaultdict[str, set[str]](set)
     pipe.set_progress_bar_config(disable=True)
     touch = unitouch_gen.example("brick")
 

@@ -66,13 +66,19 @@ def train(kind: str, data: DataConfig, trainer: TrainerConfig, output: Path, cac
     torch.manual_seed(trainer.seed)
     processor: Any = UniTouchProcessor(image_size=data.image_size, audio=data.audio)
     pixels, material, values = columns(columns_of(data.sources(), cache, data, processor, ()), kind)
-    names, touch = dict(enumerate(MATERIAL_NAMES)), kind == "touch"
+    names = dict(enumerate(MATERIAL_NAMES))
+    touch = kind == "touch"
     config = ResNetConfig(
-        **SIZES, layer_type="bottleneck", id2label=names, label2id={name: number for number, name in names.items()},
-        num_channels=3 + RELIEF_CHANNELS * touch, relief=touch, attributes=[*(ATTRIBUTES if touch else SHOWN)],
+        **SIZES,
+        layer_type="bottleneck",
+        id2label=names,
+        label2id={name: number for number, name in names.items()},
+        num_channels=3 + RELIEF_CHANNELS * touch,
+        relief=touch,
+        attributes=[*(ATTRIBUTES if touch else SHOWN)],
         attribute_means=values.mean(axis=0, dtype=np.float64).tolist(),
         attribute_deviations=values.std(axis=0, dtype=np.float64).clip(1e-3).tolist(),
-    )  # fmt: skip
+    )
     classifier = ContactClassifier(config)
     dataset = batches.ArrayDataset(pixels=pixels, material=material, attributes=batches.in_deviations(values))
     indices = partial(batches.shuffled_indices, size=len(material), batch_size=trainer.batch_size, seed=trainer.seed)
@@ -86,7 +92,8 @@ def train(kind: str, data: DataConfig, trainer: TrainerConfig, output: Path, cac
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.judges")
     parser.add_argument("--output", type=Path, default=Path("runs/judges"), help="folder for both")
-    given, data = parser.parse_args(), read(DataConfig, read_recipe("image_vae")["data"])
+    given = parser.parse_args()
+    data = read(DataConfig, read_recipe("image_vae")["data"])
     for kind, steps in STEPS.items():
         trainer = TrainerConfig(steps=steps, batch_size=64, learning_rate=2e-3, ema_decay=0.998)
         train(kind, data, trainer, given.output / f"{kind}-classifier", Path("runs/cache"))

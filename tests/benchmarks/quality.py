@@ -65,7 +65,9 @@ UNTRAINED = 5
 
 def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactClassifier) -> Figures:
     """Material by zero-shot, contacts told from others of their material, and what is read linearly off touches."""
-    material, truth, rows = contacts.material, contacts.attributes, {}
+    material = contacts.material
+    truth = contacts.attributes
+    rows = {}
     size = min(AMONG, int(torch.bincount(material).min()))
     embeds = {name: joint.features(name, getattr(contacts, name)) for name in joint.model.known_modalities}
     real: Any = touch_classifier.observe(float_pixels(contacts.touch))
@@ -77,15 +79,18 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
             rows |= {f"{name}: {key}": row for key, row in found.items()}
     if "touch" not in embeds:
         return rows
-    touch, unit = embeds["touch"], (truth - truth.mean(dim=(0, 1))) / truth.std(dim=(0, 1))
+    touch = embeds["touch"]
+    unit = (truth - truth.mean(dim=(0, 1))) / truth.std(dim=(0, 1))
     found = found_within(touch, joint.features("touch", contacts.second), material, size)
     found["ceiling"] = retrieval(unit[:, 0], unit[:, 1], material, size=size)  # by who reads every attribute exactly
     rows["touch to its touch by another sensor, within material"] = found
     if "image" in embeds:
         rows["touch to its picture, within material"] = found_within(touch, embeds["image"], material, size)
-    fifths, usual = contacts.objects % 5, torch.empty_like(truth[:, 0])
+    fifths = contacts.objects % 5
+    usual = torch.empty_like(truth[:, 0])
     for fifth in fifths.unique():
-        fit, asked = fifths != fifth, fifths == fifth
+        fit = fifths != fifth
+        asked = fifths == fifth
         usual[asked] = class_means(truth[fit, 0], material[fit], material[asked])
     read = cross_predicted(touch, truth[:, 0], fifths)
     found = agreed(read, usual, truth[:, 0], ATTRIBUTES, real.attributes)
@@ -96,18 +101,24 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
 
 
 def image_rows(
-    classifier: ContactClassifier, contacts: Contacts, modality: str, rows: Tensor, made: Mapping[str, Tensor],
+    classifier: ContactClassifier,
+    contacts: Contacts,
+    modality: str,
+    rows: Tensor,
+    made: Mapping[str, Tensor],
     again: Tensor,
-) -> Figures:  # fmt: skip
+) -> Figures:
     """Figures of images that were `made` of some rows of contacts, by what a classifier reads.
 
     The ceiling is the real image; that of finding a contact is the image `again`, under another lamp or sensor. The
     class mean of attributes is what a class can tell of them: the mean truth of its other contacts.
     """
-    real, material = float_pixels(getattr(contacts, modality)), contacts.material
+    real = float_pixels(getattr(contacts, modality))
+    material = contacts.material
     columns = [ATTRIBUTES.index(name) for name in classifier.attributes]
     truth = (contacts.attributes.mean(dim=1) if modality == "image" else contacts.attributes[:, 0])[:, columns]
-    scale, rest = classifier.scale_of_attributes(), torch.ones(len(material), dtype=torch.bool)
+    scale = classifier.scale_of_attributes()
+    rest = torch.ones(len(material), dtype=torch.bool)
     rest[rows] = False
     seen: Any = classifier.observe(real)
     size = min(AMONG, int(torch.bincount(material).min()))
@@ -150,7 +161,8 @@ def touch_to_image_rows(
 
 def x_to_touch_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, each: int, **options: Any) -> Figures:
     """Touches by a named sensor, of pictures, captions, sounds and bare words: the materials' names."""
-    rows, figures = sample_per_class(contacts, each), {}
+    rows = sample_per_class(contacts, each)
+    figures = {}
     options["sensor"] = contacts.sensors[0]
     words = [MATERIAL_NAMES[number].replace("_", " ") for number in contacts.material.tolist()]
     inputs = {"photo": contacts.image, "caption": contacts.text, "sound": contacts.sounds(), "word": words}
@@ -171,8 +183,10 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     "material of the touch" and "of the photo" are the shares that are named so.
     """
     rows = sample_per_class(contacts, each)
-    touched, names = rows.roll(each), [name for name in RELIEF if name in classifier.attributes]
-    photos, touches = float_pixels(contacts.image)[rows], float_pixels(contacts.touch)[touched]
+    touched = rows.roll(each)
+    names = [name for name in RELIEF if name in classifier.attributes]
+    photos = float_pixels(contacts.image)[rows]
+    touches = float_pixels(contacts.touch)[touched]
     truth = contacts.attributes.mean(dim=1)[touched][:, [ATTRIBUTES.index(name) for name in names]]
 
     def measure(images: Tensor) -> dict[str, float]:
@@ -187,8 +201,10 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
 
     restyle = partial(generate, pipe, seed, {"image": photos, "touch": touches}, **options)
     shown = {
-        "photo as it was": photos, "restyled photo": restyle(), "restyled as in the paper": restyle(layout=None),
-    }  # fmt: skip
+        "photo as it was": photos,
+        "restyled photo": restyle(),
+        "restyled as in the paper": restyle(layout=None),
+    }
     figures = {}
     for name, images in shown.items():
         found = with_controls(measure, {"value": images, "ceiling": float_pixels(contacts.image)[touched]})
@@ -240,11 +256,14 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     """Probes of real touches, beside plain statistics, the untouched gel and untrained encoders."""
     spaces = {"touch encoder": joint.model}
     spaces |= {f"untrained {seed}": untrained_like(joint.model, seed) for seed in range(UNTRAINED)}
-    size, figures = joint.processor.image_size, {}
+    size = joint.processor.image_size
+    figures = {}
 
     def embedded(pixels: np.ndarray) -> dict[str, np.ndarray]:
-        found = {name: replace(joint, model=model).features("touch", pixels).double().numpy()
-                 for name, model in spaces.items()}  # fmt: skip
+        found = {
+            name: replace(joint, model=model).features("touch", pixels).double().numpy()
+            for name, model in spaces.items()
+        }
         reliefs = relief(normalise_pixels(float_pixels(pixels))).movedim(1, -1).numpy()
         return found | {"statistics of the relief": statistics([128.0 + 20.0 * one for one in reliefs])}
 
@@ -258,7 +277,8 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     if (presses := next(recordings.rglob(PRESSES), None)) is not None:
         with np.load(presses) as pack:
             frames = [frame.astype(np.float32) for frame in pack["imgs"]]
-            rest, place = pack["f0"].astype(np.float32), torch.from_numpy(pack["touch_center"].astype(np.float64))
+            rest = pack["f0"].astype(np.float32)
+            place = torch.from_numpy(pack["touch_center"].astype(np.float64))
         features = embedded(square_pixels(frames, size))
         features["statistics"] = statistics([frame - rest for frame in frames])
         balls = {}
@@ -272,7 +292,8 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
 @torch.no_grad()
 def abstained(joint: JointSpace, touches: np.ndarray) -> dict[str, float]:
     """Shares of uint8 touches (N, 3, S, S) that are called untouched, and unlike anything known."""
-    model, reasons = joint.model, list[str | None]()
+    model = joint.model
+    reasons = list[str | None]()
     for part in torch.from_numpy(touches).split(256):
         reasons += model.encode_touches(normalise_pixels(part.float() / 255))[1]
     return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
@@ -288,8 +309,9 @@ def of_untrained(figures: Mapping[str, Mapping[str, float]], told: str) -> Figur
 
 
 TURBO_ROWS: dict[str, tuple[Callable[..., Figures], str]] = {
-    "touch-to-image": (touch_to_image_rows, "image"), "x-to-touch": (x_to_touch_rows, "touch"),
-}  # fmt: skip
+    "touch-to-image": (touch_to_image_rows, "image"),
+    "x-to-touch": (x_to_touch_rows, "touch"),
+}
 """How a distilled pipeline is measured: the function, and what its classifier reads."""
 
 
@@ -309,7 +331,8 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     rows = []
     for seed in seeds:
         contacts = held_out(cache, joint.processor, seed, given.split, given.touched_by, given.objects)
-        found, drawn = joint_rows(joint, contacts, judges["touch"]), (seed, given.each)
+        found = joint_rows(joint, contacts, judges["touch"])
+        drawn = (seed, given.each)
         if "touch-to-image" in pipes:
             found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn)
         if "stylization" in pipes:

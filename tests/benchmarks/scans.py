@@ -141,9 +141,12 @@ def see(joint: JointSpace, trunk: TextureTrunk | None, contacts: Contacts) -> Se
 
 
 def named_row(
-    joint: JointSpace, encoder: str, embeds: Mapping[str, Tensor], materials: Mapping[str, Tensor],
+    joint: JointSpace,
+    encoder: str,
+    embeds: Mapping[str, Tensor],
+    materials: Mapping[str, Tensor],
     statistics: Mapping[str, Tensor] | None = None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """Share of the split "test" whose material is named by text, beside its controls; by split (N, D) and int64 (N,).
 
     The class mean is that of the training split's embeddings of the true material. The ceiling is a linear probe of the
@@ -210,7 +213,8 @@ def read_linearly(known: tuple[Tensor, Tensor], asked: Tensor, gallery: Tensor) 
     source, target = (part.double().numpy() for part in known)
     scaler = StandardScaler().fit(target)
     ridge = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 6, 13))).fit(source, scaler.transform(target))
-    predicted, stored = ridge.predict(asked.double().numpy()), scaler.transform(gallery.double().numpy())
+    predicted = ridge.predict(asked.double().numpy())
+    stored = scaler.transform(gallery.double().numpy())
     return torch.from_numpy(predicted), torch.from_numpy(stored)
 
 
@@ -218,7 +222,9 @@ def joint_rows(joint: JointSpace, splits: Mapping[str, Seen], rounds: Tensor) ->
     """Materials by text; and pictures and touches of the same contact, each found among 40 surfaces."""
     rows = {"train": slice(None), "val": slice(None), "test": rounds.flatten()}
     materials = {split: splits[split].contacts.material[rows[split]] for split in SPLITS}
-    train, test, figures = splits["train"], splits["test"], Figures()
+    train = splits["train"]
+    test = splits["test"]
+    figures = Figures()
     for column, name in NAMED.items():
         embeds = {split: splits[split].embeds[column][rows[split]] for split in SPLITS}
         statistics = None
@@ -244,7 +250,8 @@ def sound_figures(joint: JointSpace) -> tuple[dict[str, float], dict[str, int]]:
     takes, of each of four materials: glass, metal, tile and wood.
     """
     takes = {split: [one for one in recordings() if one.split == split] for split in SPLITS}
-    embeds, materials = dict[str, Tensor](), dict[str, Tensor]()
+    embeds = dict[str, Tensor]()
+    materials = dict[str, Tensor]()
     for split, found in takes.items():
         clips = joint.processor.sounds([(one.samples, SAMPLE_RATE) for one in found])
         embeds[split] = joint.features("audio", clips[:, 0])
@@ -364,12 +371,14 @@ def frechet_row(classifier: ContactClassifier, pictures: Mapping[str, Tensor], r
 
 def measure(given: argparse.Namespace, cache: Path) -> Figures:
     """All that can be measured of a joint space, or of a family."""
-    joint, trunk = JointSpace.from_folder(given.joint), read_trunk(given.trunk or given.joint)
+    joint = JointSpace.from_folder(given.joint)
+    trunk = read_trunk(given.trunk or given.joint)
     if trunk is None:
         print("Left out: the teacher's features, as this joint space has no trunk (--trunk FOLDER).", flush=True)
     pipes = {name: quiet(one.pipeline, family=given.family) for name, one in MADE.items() if given.family}
     seeds = [given.first_seed + number for number in range(given.seeds)]
-    size, rows = joint.processor.image_size, list[Figures]()
+    size = joint.processor.image_size
+    rows = list[Figures]()
 
     def contacts_of(seed: int, split: str) -> Contacts:
         return world_contacts(cache, joint.processor, scanned_contacts(seed, given.train_objects), split)
@@ -381,7 +390,8 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     for seed in seeds:
         source = scanned_contacts(seed, given.train_objects)
         splits["test"] = see(joint, trunk, contacts_of(seed, "test"))
-        contacts, rounds = splits["test"].contacts, rounds_of(source)
+        contacts = splits["test"].contacts
+        rounds = rounds_of(source)
         found = joint_rows(joint, splits, rounds)
         for name, pipe in pipes.items():
             one = MADE[name]

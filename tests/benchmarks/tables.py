@@ -37,8 +37,17 @@ SHARES = ("material", "of the touch", "of the photo", "within 20", "among 40", "
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
 
 
-TOLD = ("material", "within material", "within 20", "Frechet distance", "layout kept", "of the touch", "of the photo",
-        *ANSWERS, "ROUGE-L")  # fmt: skip
+TOLD = (
+    "material",
+    "within material",
+    "within 20",
+    "Frechet distance",
+    "layout kept",
+    "of the touch",
+    "of the photo",
+    *ANSWERS,
+    "ROUGE-L",
+)
 """Ends of the names of figures that the pages show; `family.json` has them all."""
 
 
@@ -111,7 +120,8 @@ SCANNED_CONTROLS = {
 
 def elsewhere(quality: Figures) -> list[str]:
     """A line each on sensors drawn anew, and on what lies beyond the ranges of training."""
-    lines, names = [], ("touch: material", "touch to picture: material", "photo to touch: material")
+    lines = []
+    names = ("touch: material", "touch to picture: material", "photo to touch: material")
     for part, words in {"drawn": "By sensors drawn anew", "beyond": "Beyond the ranges of training"}.items():
         found = [(name, quality[part][name]) for name in names if name in quality[part]]
         told = [
@@ -124,7 +134,8 @@ def elsewhere(quality: Figures) -> list[str]:
 
 def summary_table(figures: Figures) -> str:
     """Figures of a GelSight's touches beside their controls, and a line each on what is harder."""
-    quality, scanned = figures["quality"], scanned_rows(figures)
+    quality = figures["quality"]
+    scanned = scanned_rows(figures)
     rows = []
     for name, words in SUMMARY.items():
         drawn = quality["rows"].get(name, {})
@@ -167,7 +178,8 @@ def scanned_table(figures: Figures) -> str:
 
 def scanned_summary(figures: Figures) -> str:
     """The same for README.md, less the spread and the autoencoder."""
-    found, controls = scanned_rows(figures), [key for key in SCANNED_CONTROLS if key != "reconstruction"]
+    found = scanned_rows(figures)
+    controls = [key for key in SCANNED_CONTROLS if key != "reconstruction"]
     rows = [
         [words, *(_shown(name, found.get(name, {}).get(key)) for key in ("value", *controls))]
         for name, words in SCANNED.items()
@@ -244,13 +256,14 @@ SETTINGS = (
     ("speed", '`tiny("touch-to-image-turbo")`, `tiny("x-to-touch-turbo")`', "turbo", "in four evaluations, "),
     ("what the paper did", '`solver="ddim", num_inference_steps=50, guidance_scale=9.0`', "ddim", None),
     ("the exact flow, to an error", "`tolerance=0.05`", None, None),
-)  # fmt: skip
+)
 """Which setting to take for what: the call, its name among the times, and what its figures' names begin with."""
 
 
 def settings_table(figures: Figures) -> str:
     """Which setting to take: seconds of a call for one, and the Frechet distance of what it draws, where measured."""
-    made, rows = {"touch-to-image": "touch to picture", "x-to-touch": "photo to touch"}, []
+    made = {"touch-to-image": "touch to picture", "x-to-touch": "photo to touch"}
+    rows = []
     for *words, key, beginning in SETTINGS:
         cells = []
         for pipeline, name in made.items():
@@ -265,7 +278,8 @@ def settings_table(figures: Figures) -> str:
 
 def turbo_table(figures: Figures) -> str:
     """What is drawn by default and in four evaluations, and how much faster that is than DDIM in 50 steps."""
-    quality, rows = figures["quality"]["rows"], []
+    quality = figures["quality"]["rows"]
+    rows = []
     ends = ("material", "grain within 20", "contact within material", "Frechet distance")
     for name in (f"{made}: {end}" for made in ("touch to picture", "photo to touch") for end in ends):
         both = [quality[name], quality[f"in four evaluations, {name}"]]

@@ -35,7 +35,8 @@ def test_a_sine_lights_the_cell_of_its_frequency(down: int, across: int) -> None
 
 def test_a_spectrum_grows_by_the_square_of_contrast_and_ignores_brightness() -> None:
     images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    once, twice = scans.log_spectrum(images / 4), scans.log_spectrum(images / 2 + 0.1)
+    once = scans.log_spectrum(images / 4)
+    twice = scans.log_spectrum(images / 2 + 0.1)
     torch.testing.assert_close(twice - once, torch.full_like(once, 4.0).log(), rtol=1e-3, atol=1e-3)
 
 
@@ -56,7 +57,8 @@ def test_a_round_holds_one_flat_contact_of_each_held_out_surface() -> None:
     assert set(names) == {one.name for one in heldout}
     rounds = scans.rounds_of(source)
     groups = {one.name: one.group for one in heldout}
-    assert rounds.shape == (scans.ROUNDS, len(set(groups.values()))) and rounds.shape[1] >= scans.AMONG
+    assert rounds.shape == (scans.ROUNDS, len(set(groups.values())))
+    assert rounds.shape[1] >= scans.AMONG
     assert {groups[names[row]] for row in rounds[0].tolist()} == set(groups.values())
     for surface in rounds.T:
         assert len({names[row] for row in surface.tolist()}) == 1
@@ -65,17 +67,22 @@ def test_a_round_holds_one_flat_contact_of_each_held_out_surface() -> None:
 
 
 def test_controls_of_what_is_found_are_what_they_should_be() -> None:
-    gallery, alike = random(3, 43, 60), torch.ones(2, 43, 60)
+    gallery = random(3, 43, 60)
+    alike = torch.ones(2, 43, 60)
     row = scans.found_row(gallery[:2], gallery, alike, first=5)
-    assert row["value"] == 1.0 and row["chance"] == 5 / 40
+    assert row["value"] == 1.0
+    assert row["chance"] == 5 / 40
     assert row["class_mean"] == pytest.approx(5 / 40)  # all are equally near
-    assert row["shuffled"] < 0.3 and row["ceiling"] < 0.3
+    assert row["shuffled"] < 0.3
+    assert row["ceiling"] < 0.3
     assert scans.found_row(gallery[:, others(43)], gallery, gallery)["class_mean"] == 1.0
 
 
 def test_a_linear_relation_is_read() -> None:
-    mixing, source = random(12, 20, seed=1), random(300, 12, seed=2)
-    known, asked = source[:257], source[257:]
+    mixing = random(12, 20, seed=1)
+    source = random(300, 12, seed=2)
+    known = source[:257]
+    asked = source[257:]
     read, stored = scans.read_linearly((known, 3.0 + known @ mixing), asked, 3.0 + asked @ mixing)
     assert scans.found_among(read[None], stored[None]) == 1.0
 
@@ -85,4 +92,5 @@ def test_the_built_in_joint_space_is_beside_its_controls(tmp_path: Path) -> None
     words = ["--joint", str(weights.JOINT), "--seeds", "1", "--train-objects", "2"]
     figures = scans.measure(scans.arguments(words), tmp_path)
     row = figures["rows"]["touch to its touch by a DIGIT, among 40"]
-    assert row["value"] > row["shuffled"] and figures["of"]["recorded"] == {"takes": 20, "kinds": 4, "materials": 4}
+    assert row["value"] > row["shuffled"]
+    assert figures["of"]["recorded"] == {"takes": 20, "kinds": 4, "materials": 4}

@@ -45,7 +45,8 @@ def test_the_usual_way_makes_the_same_latents_from_the_same_start(pipe):
     call = {"num_inference_steps": 4, "guidance_scale": 3.0, "output_type": "latent", "latents": noise}
     latents = usual_way(pipe)(**INPUTS, generator=torch.Generator().manual_seed(1), **call).images
     settings = {"timestep_spacing": "leading", "steps_offset": 1, "set_alpha_to_one": False, "clip_sample": False}
-    own, pipe.scheduler = pipe.scheduler, DDIMScheduler.from_config(pipe.scheduler.config, **settings)
+    own = pipe.scheduler
+    pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config, **settings)
     expected = pipe(**INPUTS, generator=torch.Generator().manual_seed(1), **call).images
     pipe.scheduler = own
     torch.testing.assert_close(latents, expected, rtol=1e-4, atol=1e-4)
@@ -60,7 +61,8 @@ def test_costs_are_the_fewest_evaluations_within_an_error(pipe):
 def test_finer_touches_are_nearer_to_the_finest() -> None:
     for settings in physics_figures(2, 1).values():
         errors = [figures["error"] for figures in settings.values()]
-        assert errors == sorted(errors, reverse=True) and errors[0] < 1.0
+        assert errors == sorted(errors, reverse=True)
+        assert errors[0] < 1.0
         assert all(figures["seconds"] > 0.0 and figures["order"] > 1.0 for figures in settings.values())
 
 
@@ -76,13 +78,15 @@ class Elements(TorchDispatchMode):
 
 
 def test_each_request_does_less_than_everything() -> None:
-    index, counts = torch.arange(2), {}
-    for names in (SCENE_MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
+    index = torch.arange(2)
+    counts = {}
+    for names in (MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
         with Elements() as elements:
             World().render(index, 0 * index, 0 * index, modalities=names, sensors=tuple(SENSORS))
         counts[names] = elements.count
-    everything = counts.pop(SCENE_MODALITIES)
-    assert max(counts.values()) < 0.9 * everything and counts["text",] < 0.01 * everything
+    everything = counts.pop(MODALITIES)
+    assert max(counts.values()) < 0.9 * everything
+    assert counts["text",] < 0.01 * everything
 
 
 @pytest.mark.slow
@@ -102,7 +106,8 @@ def test_classifiers_learn_materials_and_attributes(tmp_path, monkeypatch):
         judges.train(kind, data, trainer, tmp_path / kind, tmp_path / "cache")
         classifier = ContactClassifier.from_pretrained(tmp_path / kind, dtype=torch.float32)
         seen = classifier.observe(torch.rand(2, 3, 32, 32))
-        assert seen.attributes.shape == (2, count) and [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
+        assert seen.attributes.shape == (2, count)
+        assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
 def test_stored_figures_fill_the_marks_of_all_pages_and_the_cards(tmp_path):

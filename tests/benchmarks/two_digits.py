@@ -60,7 +60,8 @@ def two_digits(joint: JointSpace, archive: Path) -> Figures:
         rows = [row for row in index if row["unit"] in UNITS and not row["object"].startswith(("hdmi", "usb"))]
         images = [Image.open(io.BytesIO(box.read(row["file"]))).convert("RGB") for row in rows]
     pixels = joint.processor.touch(images)
-    objects, first = np.array([row["object"] for row in rows]), np.array([row["unit"] == UNITS[0] for row in rows])
+    objects = np.array([row["object"] for row in rows])
+    first = np.array([row["unit"] == UNITS[0] for row in rows])
     mean = {unit: pixels[torch.from_numpy(first == unit)].mean(dim=0) for unit in (True, False)}
     pairs = zip(pixels, first.tolist(), strict=True)
     changes = [(128.0 * (one - mean[unit])).movedim(0, -1).numpy() for one, unit in pairs]
@@ -90,7 +91,8 @@ def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -
     for rows in (first, ~first):
         features[rows] = (features[rows] - features[rows].mean(0)) / (features[rows].std(0) + 1e-6)
     features /= np.linalg.norm(features, axis=1, keepdims=True) + 1e-9
-    alike, same = features[first] @ features[~first].T, objects[first][:, None] == objects[~first][None]
+    alike = features[first] @ features[~first].T
+    same = objects[first][:, None] == objects[~first][None]
     named = objects[first]
     both = sorted(set(named) & set(objects[~first]))
     scores = [roc_auc_score(same[named == one].ravel(), alike[named == one].ravel()) for one in both]

@@ -37,7 +37,8 @@ def _render_many(first: int) -> int:
     torch.set_num_threads(1)  # many small operations, at the end of each of which threads wait for each other
     world = World()
     for start in range(first, first + CHUNK, GROUP):
-        rows, sensors = torch.arange(start, start + GROUP), (draw_sensor(0, 2 * start), draw_sensor(0, 2 * start + 1))
+        rows = torch.arange(start, start + GROUP)
+        sensors = (draw_sensor(0, 2 * start), draw_sensor(0, 2 * start + 1))
         world.render(rows % COUNT, rows // COUNT, rows * 0, sensors=sensors)
     return CHUNK
 
@@ -53,7 +54,8 @@ def physics_figures(contacts: int = 16, repeats: int = 3, refinements: tuple[int
     index = torch.arange(contacts)
     draws = draw(0, index % COUNT, torch.full_like(index, 10), index)  # each contact is of another material
     draws = draws.but(shape=0 * index, scale=torch.ones(contacts), tilt=0.0 * draws.tilt)  # rims fall between pixels
-    sensor, world = replace(SENSORS["gelsight"], contact_steps=0), World()  # which is the equation that converges
+    sensor = replace(SENSORS["gelsight"], contact_steps=0)  # which is the equation that converges
+    world = World()
     side = world.image_size
 
     def touches(finer: int, rows: slice = slice(None)) -> Tensor:

@@ -68,7 +68,8 @@ def refused() -> Callable[..., None]:
     def check(result: Result, *words: str) -> None:
         code, out, err = result
         assert (code, out) == (2, ""), err
-        assert err.startswith("unitouch-gen: ") and err.count("\n") == 1
+        assert err.startswith("unitouch-gen: ")
+        assert err.count("\n") == 1
         assert not [word for word in words if word not in err], err
 
     return check

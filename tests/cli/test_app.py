@@ -183,7 +183,8 @@ def test_a_large_upload_is_refused_in_a_line_and_leaves_nothing(visitor, tmp_pat
     before = sorted(path for path in uploads.rglob("*") if path.is_file())
     (tmp_path / "large.png").write_bytes(bytes(20 * 2**20 + 1))
     answer = visitor.upload(tmp_path / "large.png")
-    assert answer.status_code == 413 and plain(answer.text, "maximum allowed size")
+    assert answer.status_code == 413
+    assert plain(answer.text, "maximum allowed size")
     assert sorted(path for path in uploads.rglob("*") if path.is_file()) == before
     assert capfd.readouterr().err == ""
 
@@ -214,7 +215,10 @@ def test_values_that_a_field_does_not_have_are_refused_by_name(visitor, touch, c
 def test_fields_that_are_emptied_have_their_defaults(visitor, touch):
     visitor.make(touch, Steps=2, Guidance=None, Pictures=None, **{"Seed; a new one each time if empty": None})
     pictures, felt, report, seed = visitor.ended()["output"]["data"]
-    assert len(pictures) == 1 and "2 steps" in report and 0 <= int(seed) < 2**31 and "%" in felt
+    assert len(pictures) == 1
+    assert "2 steps" in report
+    assert 0 <= int(seed) < 2**31
+    assert "%" in felt
 
 
 def test_what_does_not_fit_into_memory_is_told_in_a_line(visitor, touch, failures, capfd):
@@ -236,7 +240,8 @@ def test_a_closed_tab_ends_its_job(address, visitor, touch, evaluations):
                 break
     following = Visitor(address, "the next user")
     following.make(touch, Steps=2)
-    assert following.ended()["success"] and 2 < len(evaluations) < STEPS
+    assert following.ended()["success"]
+    assert 2 < len(evaluations) < STEPS
 
 
 def test_stop_ends_a_job_and_one_that_waits(address, visitor, touch, evaluations):
@@ -251,8 +256,10 @@ def test_stop_ends_a_job_and_one_that_waits(address, visitor, touch, evaluations
             visitor.press(visitor.stop)
         said.append(message.get("log") or message["msg"])
         if message["msg"] == "process_completed":
-            assert message["success"] and all(one == {"__type__": "update"} for one in message["output"]["data"])
-    assert "Stopped." in said and "Stopped." in [message.get("log") for message in waiting.messages()]
+            assert message["success"]
+            assert all(one == {"__type__": "update"} for one in message["output"]["data"])
+    assert "Stopped." in said
+    assert "Stopped." in [message.get("log") for message in waiting.messages()]
     assert 0 < len(evaluations) < STEPS
 
 
@@ -315,9 +322,11 @@ def test_addresses_in_place_of_files_are_not_fetched(address, connected, capfd, 
 @pytest.mark.slow
 def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_up(here, models, tmp_path, files):
     try:
-        host, port = "::1", free_port("::1")
+        host = "::1"
+        port = free_port("::1")
     except OSError:  # a machine without IPv6
-        host, port = "127.0.0.1", free_port()
+        host = "127.0.0.1"
+        port = free_port()
     (tmp_path / "temporary").mkdir()
     dead = f"127.0.0.1:{free_port()}"
     environment = {
@@ -348,5 +357,7 @@ def test_the_page_is_for_this_machine_whatever_the_environment_says_and_tidies_u
     with visitor.open_tab():
         os.kill(child.process.pid, signal.SIGTERM)  # as `docker stop` does
         assert child.wait() == 0, child.err
-    assert child.out.count("\n") == 1 and child.err == ""  # no tunnel, no server of tools
-    assert list((tmp_path / "temporary").iterdir()) == [] and files(here) == before
+    assert child.out.count("\n") == 1
+    assert child.err == ""  # no tunnel, no server of tools
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert files(here) == before

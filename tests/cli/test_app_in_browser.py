@@ -41,7 +41,8 @@ def address(models, tmp_path_factory):
 @pytest.fixture
 def page(address):
     """The page, which must ask no other host for anything, and have no errors."""
-    asked, broken = [], []
+    asked = []
+    broken = []
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 375, "height": 812})  # a phone's
@@ -71,7 +72,8 @@ def make(page) -> str:
 
 def test_a_touch_becomes_a_picture(page):
     upload(page, "Touch", str(example("brick")))
-    assert "2 steps" in make(page) and "%" in page.get_by_label("Feels like").first.input_value()
+    assert "2 steps" in make(page)
+    assert "%" in page.get_by_label("Feels like").first.input_value()
 
 
 def test_a_photo_is_restyled_and_what_is_missing_is_told(page):
@@ -80,7 +82,8 @@ def test_a_photo_is_restyled_and_what_is_missing_is_told(page):
     page.get_by_role("button", name="Make it").locator("visible=true").click()
     said = page.get_by_test_id("toast-text").first
     said.wait_for()
-    assert "`image` is missing" in said.inner_text() and "\n" not in said.inner_text()
+    assert "`image` is missing" in said.inner_text()
+    assert "\n" not in said.inner_text()
     upload(page, "Photo", str(example("wood", "image")))
     assert "steps" in make(page)
 

@@ -231,7 +231,8 @@ def test_help_and_mistyped_names_do_not_wait_for_torch(here):
                 main()
             print("torch" in sys.modules)"""
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert ended.stdout.count("False\n") == 3 and ended.stderr.count("\n") == 2
+    assert ended.stdout.count("False\n") == 3
+    assert ended.stderr.count("\n") == 2
 
 
 @pytest.mark.parametrize("words", [["-o", "~/made"], ["--output=~/made"]])
@@ -239,18 +240,21 @@ def test_a_tilde_is_the_home_folder_also_where_the_shell_leaves_it(here, command
     monkeypatch.setenv("HOME", str(here / "home"))
     code, _, err = command("touch-to-image", "in/dark.png", *words, "--steps", "2", "--model", models["touch-to-image"])
     assert code == 0, err
-    assert (here / "home" / "made" / "dark.png").is_file() and not (here / "~").exists()
+    assert (here / "home" / "made" / "dark.png").is_file()
+    assert not (here / "~").exists()
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_an_interrupt_ends_with_130_and_leaves_no_temporary_folder(here, models, name):
-    touches, model = ["in/dark.png"] * 500, ["--model", models["touch-to-image"]]
+    touches = ["in/dark.png"] * 500
+    model = ["--model", models["touch-to-image"]]
     child = Child(commanded, "touch-to-image", *touches, "-o", "out", "--batch-size", "1", *model, folder=here)
     while not list(here.glob("out/*.png")):
         assert child.process.is_alive(), child.err
         time.sleep(0.05)
     os.kill(child.process.pid, getattr(signal, name))
-    assert child.wait() == 130 and list(here.glob("out/.*")) == []
+    assert child.wait() == 130
+    assert list(here.glob("out/.*")) == []
     assert child.err == "unitouch-gen: stopped; what is written is whole.\n"
 
 

@@ -34,13 +34,15 @@ def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
         "\ufeffTouch;name;prompt;seed\ndark.png;walls/one;rough, brick;5.0\nbright.png;;wood;\n;;;\ndark.png;;;6\n"
     )
     code, out, err = run("in/table.CSV", "--seed", 4, "--steps", 3, "--sensor", "digit", "--set", "strength=0.5")
-    assert (code, err) == (0, "") and f"3 of 3 pictures are in {here / 'out'}" in out
+    assert (code, err) == (0, "")
+    assert f"3 of 3 pictures are in {here / 'out'}" in out
     assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "walls/one.png"]
     told = {Path(line["picture"]).stem: (line["seed"], line["num_inference_steps"]) for line in lines(here / "out")}
     assert told == {"one": (5, 3), "bright": (4, 3), "dark": (6, 3)}
     seed = torch.Generator().manual_seed(5)
-    alone = pipes["touch-to-image"]("in/dark.png", "rough, brick", sensor="digit", strength=0.5, num_inference_steps=3,
-                                    generator=seed).images[0]  # fmt: skip
+    alone = pipes["touch-to-image"](
+        "in/dark.png", "rough, brick", sensor="digit", strength=0.5, num_inference_steps=3, generator=seed
+    ).images[0]
     assert abs(np.asarray(alone, dtype=int) - np.asarray(Image.open("out/walls/one.png"))).max() <= 1
 
 
@@ -67,18 +69,22 @@ def test_words_and_folders_for_x_to_touch(here, run, files):
     soundfile.write("in/hit.wav", np.random.default_rng(0).normal(0, 0.1, 4000), 16_000)
     assert run("in", pipeline="x-to-touch")[0] == 0
     wanted = ["brick-2.png", "brick.png", "bright.png", "dark.png", "hit.png", "manifest.jsonl"]
-    assert files(here / "out") == wanted and len(lines(here / "out")) == 5
+    assert files(here / "out") == wanted
+    assert len(lines(here / "out")) == 5
 
 
 def test_items_that_fail_are_told_and_tried_again(here, run, files):
     (here / "in" / "notes.png").write_text("no picture")
     for _ in range(2):
         code, out, err = run("in", "--batch-size", 8)
-        assert code == 1 and "2 of 3 pictures are in" in out
-        assert err.startswith("unitouch-gen: out/notes.png failed: `touch") and err.count("\n") == 1
+        assert code == 1
+        assert "2 of 3 pictures are in" in out
+        assert err.startswith("unitouch-gen: out/notes.png failed: `touch")
+        assert err.count("\n") == 1
     before = (here / "out" / "dark.png").stat().st_mtime_ns
     Image.new("RGB", (32, 32)).save("in/notes.png")
-    assert run("in")[0] == 0 and (here / "out" / "dark.png").stat().st_mtime_ns == before
+    assert run("in")[0] == 0
+    assert (here / "out" / "dark.png").stat().st_mtime_ns == before
     assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "notes.png"]
 
 
@@ -100,5 +106,6 @@ def test_processes_of_a_launcher_share_the_work(here, models):
     launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--no-python"]
     command = [sys.executable, "-m", *launcher, sys.executable, "-c", script, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout.count("6 of 6 pictures are in") == 1, done.stderr
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("6 of 6 pictures are in") == 1, done.stderr
     assert sorted(line["seed"] for line in lines(here / "out")) == [*range(6)]

@@ -20,8 +20,11 @@ def test_a_data_set_is_told(command, folder):
         (folder / name).write_bytes(b"left by a system")
     code, out, _ = command("data", "check", folder, "--sensor", "digit")
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in out.splitlines() if "│" in line]
-    assert code == 0 and ["material", "wood", "2"] in rows and ["sensor", "digit", "3"] in rows
-    assert "1 of 3 touches are there more than once" in out and "belong to no touch: Thumbs.db\n" in out
+    assert code == 0
+    assert ["material", "wood", "2"] in rows
+    assert ["sensor", "digit", "3"] in rows
+    assert "1 of 3 touches are there more than once" in out
+    assert "belong to no touch: Thumbs.db\n" in out
 
 
 def test_all_that_is_wrong_is_told_and_ends_it_with_1(command, tmp_path):
@@ -38,7 +41,8 @@ def test_all_that_is_wrong_is_told_and_ends_it_with_1(command, tmp_path):
     (tmp_path / "5.npy").write_text("gone")
     code, out, _ = command("data", "check", tmp_path)
     lines = out.splitlines()[-3:]
-    assert code == 1 and lines[0] == "1 of 4 objects are in more than one of its own splits"
+    assert code == 1
+    assert lines[0] == "1 of 4 objects are in more than one of its own splits"
     assert lines[1].startswith("3 of 8 records cannot be read: 3.png: ")
     assert all(name in lines[1] for name in ("; 4.png: ", "picture4.png", "; 5.png: "))
     assert lines[2] == "1 of 8 touches are there more than once: 0.png = 7.png"

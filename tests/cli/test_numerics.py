@@ -25,7 +25,8 @@ def table(monkeypatch):
 def test_cases_are_run_by_name(command, table):
     table(FINE, FAR, RAISING)
     code, out, _ = command("stability", "--only", "fine")
-    assert code == 0 and "far off" not in out
+    assert code == 0
+    assert "far off" not in out
     assert all(words in out for words in ("fine", "a closed form", "0.5", "0.25", "1 of 1 cases hold."))
 
 
@@ -33,7 +34,9 @@ def test_a_case_that_fails_exits_with_1_after_the_others(command, table):
     for case in (FAR, UNKNOWN, RAISING):
         table(case, FINE)
         code, out, _ = command("stability")
-        assert code == 1 and "FAILED" in out and "1 of 2 cases hold." in out, case.name
+        assert code == 1, case.name
+        assert "FAILED" in out, case.name
+        assert "1 of 2 cases hold." in out, case.name
 
 
 @pytest.mark.parametrize("name", ["touch-to-image", "stylize", "x-to-touch"])
@@ -54,9 +57,14 @@ def test_a_chart_of_error_and_time(here, command, models, target):
         DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2).save_pretrained(folder / "scheduler")
     points = ["--solvers", "euler,tolerance", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1]
     code, out, err = command("work-precision", *words, *points, "-o", "chart")
-    assert code == 0 and "Chart and results are in" in out, err
+    assert code == 0, err
+    assert "Chart and results are in" in out, err
     rows = json.loads((here / "chart/results.json").read_text())["rows"]
     assert [(row["solver"], row["steps"], row["tolerance"]) for row in rows] == [
-        ("euler", 4, None), ("euler", 8, None), ("tolerance", None, 0.1)]  # fmt: skip
+        ("euler", 4, None),
+        ("euler", 8, None),
+        ("tolerance", None, 0.1),
+    ]
     assert rows[1]["error"] < rows[0]["error"]
-    assert re.search(r"euler .*4 steps, .*s.*\n", out) and "for an error of" in out
+    assert re.search(r"euler .*4 steps, .*s.*\n", out)
+    assert "for an error of" in out

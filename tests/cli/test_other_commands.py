@@ -26,7 +26,8 @@ def test_classify_says_what_the_library_says(command):
     classifier = ZeroShotTouchClassifier(*joint_space())
     for name, row in zip(("brick", "wood"), json.loads(out)["touches"], strict=True):
         [named] = classifier(example(name), labels, top=2)
-        assert row["labels"] == pytest.approx(named) and row["unknown"] == named.unknown
+        assert row["labels"] == pytest.approx(named)
+        assert row["unknown"] == named.unknown
     assert "gelsight_brick.png" in command(*words)[1]
 
 
@@ -36,7 +37,8 @@ def test_published_files_become_a_folder(command, tmp_path):
     files = [word for name, file in encoders.items() for word in (f"--{name}", file)]
     words = ("convert", "unitouch", *files, "--config", tmp_path / "config.json", "--dtype", "bfloat16")
     code, out, err = command(*words, "-o", tmp_path / "model")
-    assert (code, err) == (0, "") and "CC-BY-NC-4.0" in out
+    assert (code, err) == (0, "")
+    assert "CC-BY-NC-4.0" in out
     model = UniTouchModel.from_pretrained(tmp_path / "model", dtype=torch.bfloat16)
     assert model.known_modalities == ("image", "text", "audio", "touch")
 
@@ -53,11 +55,13 @@ def test_doctor_runs_in_a_clone_that_is_not_installed(command, models, monkeypat
 
     monkeypatch.setattr(import_module("unitouch_gen.cli.doctor"), "requires", unknown)
     code, out, err = command("doctor", "--model", models["x-to-touch"], "--device", "cpu")
-    assert (code, err) == (0, "") and "2 steps" in out
+    assert (code, err) == (0, "")
+    assert "2 steps" in out
 
 
 def test_questions_are_answered_about_every_touch(command, refused, here, capsys):
-    parts, language = make_components(), make_language_parts()
+    parts = make_components()
+    language = make_language_parts()
     joint = {name: parts[name] for name in ("unitouch", "processor")}
     TouchToTextPipeline(**language, **joint).save_pretrained(here / "ask")
     capsys.readouterr()
@@ -66,7 +70,8 @@ def test_questions_are_answered_about_every_touch(command, refused, here, capsys
     answers = [row["answer"] for row in json.loads(out)["touches"]]
     assert (code, err, len(answers)) == (0, "", 2)
     printed = command(*words)[1]
-    assert "bright.png: " in printed and all(answer in printed for answer in answers)
+    assert "bright.png: " in printed
+    assert all(answer in printed for answer in answers)
     assert command("ask", "in/bright.png", *words[2:])[1] == f"{answers[0]}\n"
     refused(command(*words[:2], " ", *words[3:]), "`question` is blank")
 
@@ -77,5 +82,6 @@ def test_touch_llm_becomes_a_pipeline(command, tmp_path):
     touch_llm_files(tmp_path / "llama", len(tokenizer), legacy=False)
     words = ("--bridge", tmp_path / "llama.pth", "--llama", tmp_path / "llama", "-o", tmp_path / "out")
     code, out, _ = command("convert", "touch-llm", *words)
-    assert code == 0 and "CC-BY-NC-4.0" in out
+    assert code == 0
+    assert "CC-BY-NC-4.0" in out
     assert TouchToTextPipeline.from_pretrained(tmp_path / "out").embedding_dim == 16

@@ -42,10 +42,19 @@ def test_pictures_are_those_of_the_pipeline(here, run, pipes):
     settings = "--solver ddim --set height=24 --set eta=0.5"
     run(f"touch-to-image in/dark.png -o out --seed 3 {words} {settings}", "--prompt", "rough brick")
     expected = pipes["touch-to-image"](
-        "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=1.5, sensor="digit", solver="ddim",
-        strength=0.5, negative_prompt="wood", noise_level=30, height=24, eta=0.5,
+        "in/dark.png",
+        "rough brick",
+        num_inference_steps=4,
+        guidance_scale=1.5,
+        sensor="digit",
+        solver="ddim",
+        strength=0.5,
+        negative_prompt="wood",
+        noise_level=30,
+        height=24,
+        eta=0.5,
         generator=torch.Generator().manual_seed(3),
-    ).images[0]  # fmt: skip
+    ).images[0]
     assert np.array_equal(pixels("out/dark.png"), np.asarray(expected))
 
 
@@ -57,9 +66,11 @@ def test_a_picture_is_the_same_alone_and_among_others(here, run):
         for number in (1, 2)
     ]
     run("touch-to-image in/bright.png -o alone.png")
-    assert same("alone.png", "two/bright-1.png") and not same("alone.png", "two/bright-2.png")
+    assert same("alone.png", "two/bright-1.png")
+    assert not same("alone.png", "two/bright-2.png")
     run("touch-to-image in/bright.png -o seed.jpg --seed 1")
-    assert Image.open("seed.jpg").format == "JPEG" and not same("seed.jpg", "two/bright-1.png")
+    assert Image.open("seed.jpg").format == "JPEG"
+    assert not same("seed.jpg", "two/bright-1.png")
 
 
 def test_a_photo_is_restyled_by_each_touch(here, run, pipes):
@@ -71,8 +82,12 @@ def test_a_photo_is_restyled_by_each_touch(here, run, pipes):
 
 def test_anything_becomes_a_touch(here, run):
     soundfile.write("hit.wav", np.random.default_rng(0).normal(0, 0.1, 4000), 16_000)
-    for option, value, stem in (("image", "in/dark.png", "dark"), ("text", "Rough_brick!", "rough_brick"),
-                                ("audio", "hit.wav", "hit"), ("touch", "in/bright.png", "bright")):  # fmt: skip
+    for option, value, stem in (
+        ("image", "in/dark.png", "dark"),
+        ("text", "Rough_brick!", "rough_brick"),
+        ("audio", "hit.wav", "hit"),
+        ("touch", "in/bright.png", "bright"),
+    ):
         (row,) = run(f"x-to-touch --{option} {value} -o out")["pictures"]
         assert (row[option], row["sensor"], row["picture"]) == (value, "gelsight", f"out/{stem}-gelsight.png")
 
@@ -139,4 +154,5 @@ def test_a_picture_that_cannot_be_saved_leaves_the_one_before_it(tmp_path):
     before = (tmp_path / "picture.jpg").read_bytes()
     with pytest.raises(InvalidInputError, match="`--output` cannot be written"):
         save(Image.new("RGB", (70_000, 1)), tmp_path / "picture.jpg")
-    assert (tmp_path / "picture.jpg").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+    assert (tmp_path / "picture.jpg").read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1

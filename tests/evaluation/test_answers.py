@@ -26,9 +26,13 @@ def contacts() -> Contacts:
     attributes[:, lying] = torch.rand(len(material), 3, generator=torch.Generator().manual_seed(0))
     draws = World(0).draw(material, number, torch.zeros_like(number))
     made = Contacts(
-        np.zeros((len(material), 3, 8, 8), np.uint8), [None] * len(material), number, {"material": material},
-        {"material": MATERIAL_NAMES}, asked=partial(list, asked_of(draws, attributes)),
-    )  # fmt: skip
+        np.zeros((len(material), 3, 8, 8), np.uint8),
+        [None] * len(material),
+        number,
+        {"material": material},
+        {"material": MATERIAL_NAMES},
+        asked=partial(list, asked_of(draws, attributes)),
+    )
     made.features = {"touch": torch.eye(len(material)), "image": torch.eye(len(material))}
     return made
 
@@ -56,9 +60,13 @@ def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
             one[topic] = (topic, answers)
     rows = caption_table(Knowing(contacts), {"train": contacts, "test": contacts}, lambda texts: torch.eye(102)[::6], 6)
     assert rows["touch"] == rows["picture"] == pytest.approx(dict.fromkeys(rows["touch"], 1.0))
-    usual, shuffled = rows["most frequent answer"], rows["shuffled touches"]
-    assert usual["grasp"] == usual["hard or soft"] == 0.5 and usual["material"] < 0.1
-    assert shuffled["material"] < 0.2 and shuffled["contact place"] < 0.9 and shuffled["ROUGE-L"] < 1.0
+    usual = rows["most frequent answer"]
+    shuffled = rows["shuffled touches"]
+    assert usual["grasp"] == usual["hard or soft"] == 0.5
+    assert usual["material"] < 0.1
+    assert shuffled["material"] < 0.2
+    assert shuffled["contact place"] < 0.9
+    assert shuffled["ROUGE-L"] < 1.0
     assert rows["zero-shot classifier"] == {"material": pytest.approx(22 / 102)}  # a tie is the first one
 
 

@@ -19,7 +19,8 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("count", [2, 3, 64])
 def test_others_are_each_sample_once_and_never_the_same_one(count):
     rows = others(count)
-    assert rows.sort().values.tolist() == list(range(count)) and not bool((rows == torch.arange(count)).any())
+    assert rows.sort().values.tolist() == list(range(count))
+    assert not bool((rows == torch.arange(count)).any())
 
 
 def test_class_means_are_those_of_each_class():
@@ -40,12 +41,14 @@ def test_controls_stand_beside_each_figure():
     found = with_controls(measure, {"value": values, "class_mean": class_means(values, LABELS), "ceiling": values})
     assert set(found) == {"own", "length"}
     assert found["own"]["value"] == found["own"]["ceiling"] == 1.0
-    assert found["own"]["class_mean"] == pytest.approx(1 / 16) and found["own"]["shuffled"] < 0.15
+    assert found["own"]["class_mean"] == pytest.approx(1 / 16)
+    assert found["own"]["shuffled"] < 0.15
     assert found["length"]["shuffled"] == pytest.approx(found["length"]["value"])
 
 
 def test_statistics_tell_how_strong_and_how_fine_a_change_is():
-    flat, ramp = np.zeros((32, 32, 3)), np.broadcast_to(np.arange(32.0)[:, None, None], (32, 32, 3))
+    flat = np.zeros((32, 32, 3))
+    ramp = np.broadcast_to(np.arange(32.0)[:, None, None], (32, 32, 3))
     nothing, one, twice = statistics([flat, ramp, 2 * ramp])
     assert not nothing.any()
     np.testing.assert_allclose(twice, 2 * one)
@@ -55,7 +58,8 @@ def test_statistics_tell_how_strong_and_how_fine_a_change_is():
 def test_others_of_the_class_are_those_of_all_draws():
     # One of three rivals is nearer: where one is drawn it is that one in a third of all draws, of two in two thirds.
     gallery = torch.tensor([[1.0, 0.2], [1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.01]])
-    labels, query = torch.tensor([0, 0, 0, 0, 1]), torch.tensor([[1.0, 0.0]])
+    labels = torch.tensor([0, 0, 0, 0, 1])
+    query = torch.tensor([[1.0, 0.0]])
     for size, share in ((2, 2 / 3), (3, 1 / 3), (4, 0.0)):
         assert metrics.retrieval(query, gallery, labels, torch.tensor([0]), size=size) == pytest.approx(share)
     alike = torch.ones(80, 2)
@@ -66,13 +70,17 @@ def test_others_of_the_class_are_those_of_all_draws():
 def test_several_places_count_where_they_are_asked_for():
     # Rivals of the query at (1, 0) in the order of their distance; its own sample comes third.
     gallery = torch.tensor([[1.0, 0.3], [1.0, 0.1], [1.0, -0.2], [0.0, 1.0], [-1.0, 0.0]])
-    query, row, labels = torch.tensor([[1.0, 0.0]]), torch.tensor([0]), torch.zeros(5, dtype=torch.int64)
+    query = torch.tensor([[1.0, 0.0]])
+    row = torch.tensor([0])
+    labels = torch.zeros(5, dtype=torch.int64)
     found = [metrics.retrieval(query, gallery, labels, row, size=5, first=first) for first in range(1, 6)]
     assert found == pytest.approx([0.0, 0.0, 1.0, 1.0, 1.0])
 
 
 def test_mean_average_precision_is_scikit_learns():
-    queries, gallery, objects = random(30, 3), random(30, 3, seed=1), torch.arange(30) // 3
+    queries = random(30, 3)
+    gallery = random(30, 3, seed=1)
+    objects = torch.arange(30) // 3
     cosine = F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
     each = [average_precision_score(objects == one, row) for one, row in zip(objects, cosine.numpy(), strict=True)]
     assert metrics.mean_average_precision(queries, gallery, objects) == pytest.approx(np.mean(each), abs=1e-6)
@@ -84,7 +92,8 @@ def test_mean_average_precision_is_scikit_learns():
 def test_what_two_views_share_is_found(method, least):
     shared = random(400, 4).double()
     one, other = (shared @ random(4, width, seed=width).double() for width in (12, 8))
-    pairs, rows = (one[:200], other[:200]), torch.arange(200)
+    pairs = (one[:200], other[:200])
+    rows = torch.arange(200)
     found = metrics.correlated(method, pairs, one[200:], other[200:], components=4)
     assert metrics.mean_average_precision(*found, rows) > least
     strange = metrics.correlated(method, pairs, one[200:], random(200, 8, seed=3), components=4)
@@ -95,7 +104,8 @@ def test_the_distance_of_gaussians_is_that_of_their_moments():
     seen = random(4000, 3).double()
     seen = seen - seen.mean(dim=0)
     white = seen @ torch.linalg.inv(torch.linalg.cholesky(torch.cov(seen.T))).T  # deviation 1, uncorrelated
-    scale, shift = torch.tensor([1.0, 2.0, 0.5]).double(), torch.tensor([0.0, 1.0, -2.0]).double()
+    scale = torch.tensor([1.0, 2.0, 0.5]).double()
+    shift = torch.tensor([0.0, 1.0, -2.0]).double()
     expected = (shift**2).sum() + ((scale - 1.0) ** 2).sum()
     assert metrics.frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
     assert metrics.frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)

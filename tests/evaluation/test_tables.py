@@ -95,27 +95,33 @@ def test_of_real_images_every_measure_is_its_best(splits):
     measure = measures_of(splits, judges, "image", rows)
     own, other, noise = (measure(images) for images in (real, real.roll(1, 0), torch.rand_like(real) ** 4))
     assert own["contact, among 16"] == 1.0 > other["contact, among 16"]
-    assert own["distance"] == pytest.approx(other["distance"], rel=1e-4) and own["distance"] < noise["distance"]
-    assert own["as real"] == 1.0 and set(own) == {"CVTP", "as real", "contact, among 16", "distance"}
+    assert own["distance"] == pytest.approx(other["distance"], rel=1e-4)
+    assert own["distance"] < noise["distance"]
+    assert own["as real"] == 1.0
+    assert set(own) == {"CVTP", "as real", "contact, among 16", "distance"}
 
 
 def test_pictures_agree_with_their_own_touches_alone(splits):
     """Pictures that are the touches, seen by one classifier."""
     same = {name: replace(one, image=one.touch) for name, one in splits.items()}
-    judges, rows = dict.fromkeys(("image", "touch"), sloping()), torch.arange(COUNT // 2)
+    judges = dict.fromkeys(("image", "touch"), sloping())
+    rows = torch.arange(COUNT // 2)
     images = torch.from_numpy(same["test"].image[: COUNT // 2]).float() / 255
     measure = measures_of(same, judges, "image", rows)
     own, other = (measure(part)["CVTP"] for part in (images, images.roll(1, 0)))
-    assert own > 0.95 and abs(other) < 0.5
+    assert own > 0.95
+    assert abs(other) < 0.5
 
 
 def test_means_of_classes_are_as_long_as_embeddings():
-    embeds, one = torch.randn(COUNT, 1, 4, generator=torch.Generator().manual_seed(0)), contacts(0)
+    embeds = torch.randn(COUNT, 1, 4, generator=torch.Generator().manual_seed(0))
+    one = contacts(0)
     rows = torch.arange(0, COUNT, 3)
     found = beside_class_means(lambda text: text, "text", embeds, one, rows)
     torch.testing.assert_close(found["value"], embeds[rows])
     torch.testing.assert_close(found["class_mean"].norm(dim=-1), embeds[rows].norm(dim=-1))
-    first, twelfth = found["class_mean"][0], found["class_mean"][16]  # rows 0 and 48 are of one class
+    first = found["class_mean"][0]
+    twelfth = found["class_mean"][16]  # rows 0 and 48 are of one class
     assert torch.cosine_similarity(first, twelfth).item() == pytest.approx(1.0)
     one.labels["material"][0] = -1
     assert set(beside_class_means(lambda text: text, "text", embeds, one, rows)) == {"value"}

@@ -28,7 +28,8 @@ def images() -> torch.Tensor:
 
 
 def test_embeddings_of_texts_are_at_unit_length(classifier):
-    model, processor = classifier.model, classifier.processor
+    model = classifier.model
+    processor = classifier.processor
     classes = text_embeddings(model, processor, [f"this feels like {name}" for name in NAMES])
     with torch.no_grad():
         text = model.get_text_features(processor.text("this feels like grass")["input_ids"])[0]
@@ -40,7 +41,8 @@ def test_embeddings_of_texts_are_at_unit_length(classifier):
 def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifier, images):
     asked = [(template or PROMPTS["touch"]).format(name) for name in NAMES]
     classes = text_embeddings(classifier.model, classifier.processor, asked).double().numpy()
-    model, pixels = classifier.model, classifier.processor.touch(images)
+    model = classifier.model
+    pixels = classifier.processor.touch(images)
     with torch.no_grad():
         embeds = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).double().numpy()
     cosines = embeds @ classes.T / np.linalg.norm(embeds, axis=1, keepdims=True)
@@ -51,13 +53,15 @@ def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifie
 
 
 def test_what_is_known_is_said_in_words():
-    shares, unlike = {"brick": 0.8, "tile": 0.12}, "unlike anything known"
+    shares = {"brick": 0.8, "tile": 0.12}
+    unlike = "unlike anything known"
     assert str(Named(shares, None)) == "brick 80%, tile 12%"
     assert str(Named(shares, unlike)) == f"{unlike} (nearest: brick)"
     assert str(Named(shares, "nothing is touched")) == "nothing is touched"
 
 
 def test_only_the_best_are_named(classifier, images):
-    whole, best = classifier(images, NAMES, top=99), classifier(images, NAMES, top=2)
+    whole = classifier(images, NAMES, top=99)
+    best = classifier(images, NAMES, top=2)
     assert [list(one.items())[:2] for one in whole] == [list(one.items()) for one in best]
     assert {name for named in classifier(images) for name in named} == set(MATERIAL_NAMES)

@@ -17,26 +17,57 @@ from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipel
 D = 16
 
 AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
-CLIP = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2,
-        "projection_dim": D}  # fmt: skip
-VIT = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8,
-       "projection_dim": D}  # fmt: skip
+CLIP = {
+    "hidden_size": 16,
+    "intermediate_size": 32,
+    "num_hidden_layers": 1,
+    "num_attention_heads": 2,
+    "projection_dim": D,
+}
+VIT = {
+    "hidden_size": 16,
+    "num_hidden_layers": 1,
+    "num_attention_heads": 2,
+    "patch_size": 8,
+    "patch_stride": 8,
+    "projection_dim": D,
+}
 SPACE = {
-    "projection_dim": D, "sensors": ["gelsight", "digit"], "sensor_tokens": 2, "prototype_size": 32,
+    "projection_dim": D,
+    "sensors": ["gelsight", "digit"],
+    "sensor_tokens": 2,
+    "prototype_size": 32,
     "vision_config": {**CLIP, "image_size": 32, "patch_size": 8},
     "text_config": {**CLIP, "vocab_size": 600, "max_position_embeddings": 32},
     "touch_config": {**VIT, "image_height": 32, "image_width": 32},
     "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
-}  # fmt: skip
+}
 
 
-UNET = {"sample_size": 8, "block_out_channels": (8,), "layers_per_block": 1, "cross_attention_dim": D,
-        "down_block_types": ("CrossAttnDownBlock2D",), "up_block_types": ("CrossAttnUpBlock2D",),
-        "attention_head_dim": 2, "norm_num_groups": 4}  # fmt: skip
-VAE = {"block_out_channels": (8, 8), "norm_num_groups": 4, "down_block_types": ("DownEncoderBlock2D",) * 2,
-       "up_block_types": ("UpDecoderBlock2D",) * 2}  # fmt: skip
-LLAMA = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4,
-         "max_position_embeddings": 64, "tie_word_embeddings": True}  # fmt: skip
+UNET = {
+    "sample_size": 8,
+    "block_out_channels": (8,),
+    "layers_per_block": 1,
+    "cross_attention_dim": D,
+    "down_block_types": ("CrossAttnDownBlock2D",),
+    "up_block_types": ("CrossAttnUpBlock2D",),
+    "attention_head_dim": 2,
+    "norm_num_groups": 4,
+}
+VAE = {
+    "block_out_channels": (8, 8),
+    "norm_num_groups": 4,
+    "down_block_types": ("DownEncoderBlock2D",) * 2,
+    "up_block_types": ("UpDecoderBlock2D",) * 2,
+}
+LLAMA = {
+    "hidden_size": 32,
+    "intermediate_size": 48,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 4,
+    "max_position_embeddings": 64,
+    "tie_word_embeddings": True,
+}
 
 
 def clip_tokenizer() -> CLIPTokenizer:
@@ -66,10 +97,16 @@ def make_components() -> dict:
     unet = UNet2DConditionModel(**UNET, class_embed_type="projection", projection_class_embeddings_input_dim=2 * D)
     vae = AutoencoderKL(**VAE, latent_channels=4, sample_size=16)
     text_config = CLIPTextConfig(
-        vocab_size=len(tokenizer), hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2,
-        max_position_embeddings=12, bos_token_id=tokenizer.bos_token_id, eos_token_id=tokenizer.eos_token_id,
+        vocab_size=len(tokenizer),
+        hidden_size=16,
+        intermediate_size=32,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        max_position_embeddings=12,
+        bos_token_id=tokenizer.bos_token_id,
+        eos_token_id=tokenizer.eos_token_id,
         pad_token_id=tokenizer.pad_token_id,
-    )  # fmt: skip
+    )
     return {
         "unitouch": model,
         "processor": UniTouchProcessor(image_size=32, audio=AUDIO, tokenizer=tokenizer),

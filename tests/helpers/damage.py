@@ -69,7 +69,8 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 def whole_files(here: Path) -> dict[str, bytes]:
     """Still images, recordings and sounds by name."""
-    noise, moves = np.random.default_rng(0), [Image.fromarray(frame) for frame in recordings.frames(noise=0.0)]
+    noise = np.random.default_rng(0)
+    moves = [Image.fromarray(frame) for frame in recordings.frames(noise=0.0)]
     for name in ("png", "jpg", "tif", "webp"):
         moves[20].save(here / f"still.{name}")
     Image.fromarray(noise.integers(0, 4096, (48, 64)).astype(np.uint16)).save(here / "still.deep.png")
@@ -84,15 +85,69 @@ def whole_files(here: Path) -> dict[str, bytes]:
 
 NAN = float("nan")
 ODD: list[Any] = [
-    NAN, float("inf"), -1, 0, 1.5, True, 10**400, 1j, "", " ", "junk", "\ud800", "a\0b", b"x", [], (), {},
-    {"a": 1}, {1, 2}, object(), np.float64("nan"), np.int64(-5), np.array(NAN), np.zeros((3, 3)), torch.tensor(NAN),
-    torch.zeros(2, 3), torch.zeros(0), torch.eye(16).to_sparse(), torch.zeros(3, 16, 16, device="meta"), np.array("x"),
-    lambda *_: None, int, iter([1]), range(3), [None], [NAN], [[1]], ["gone.png"], Path("gone"),
-]  # fmt: skip
+    NAN,
+    float("inf"),
+    -1,
+    0,
+    1.5,
+    True,
+    10**400,
+    1j,
+    "",
+    " ",
+    "junk",
+    "\ud800",
+    "a\0b",
+    b"x",
+    [],
+    (),
+    {},
+    {"a": 1},
+    {1, 2},
+    object(),
+    np.float64("nan"),
+    np.int64(-5),
+    np.array(NAN),
+    np.zeros((3, 3)),
+    torch.tensor(NAN),
+    torch.zeros(2, 3),
+    torch.zeros(0),
+    torch.eye(16).to_sparse(),
+    torch.zeros(3, 16, 16, device="meta"),
+    np.array("x"),
+    lambda *_: None,
+    int,
+    iter([1]),
+    range(3),
+    [None],
+    [NAN],
+    [[1]],
+    ["gone.png"],
+    Path("gone"),
+]
 """Arguments that hardly any parameter takes."""
 
-WORDS = [*"-*[~0= ", "", "nan", "-1", "1e999", "9" * 50, "junk", "a=b", "{}", "gone.png", "in", "in/a.png", "table.csv",
-         "/proc/self/x", "/dev/null", "example:junk", "cuda:99", "a" * 5000, "\udcff"]  # fmt: skip
+WORDS = [
+    *"-*[~0= ",
+    "",
+    "nan",
+    "-1",
+    "1e999",
+    "9" * 50,
+    "junk",
+    "a=b",
+    "{}",
+    "gone.png",
+    "in",
+    "in/a.png",
+    "table.csv",
+    "/proc/self/x",
+    "/dev/null",
+    "example:junk",
+    "cuda:99",
+    "a" * 5000,
+    "\udcff",
+]
 """The same on a command line."""
 
 

@@ -12,7 +12,8 @@ from unitouch_gen.world import MATERIAL_NAMES
 
 Colour = tuple[int, int, int]
 
-RED, BLUE = (200, 40, 30), (40, 50, 210)
+RED = (200, 40, 30)
+BLUE = (40, 50, 210)
 
 
 def shade(number: int) -> Colour:

@@ -95,7 +95,8 @@ class ImageBind(nn.Module):
         self.modality_preprocessors, self.modality_trunks = nn.ModuleDict(), nn.ModuleDict()
         self.modality_heads, self.modality_postprocessors = nn.ModuleDict(), nn.ModuleDict()
         for name in modalities:
-            part, width = parts[name], parts[name].hidden_size
+            part = parts[name]
+            width = parts[name].hidden_size
             head = [nn.LayerNorm(width, eps=1e-6), nn.Linear(width, config.projection_dim, bias=False)]
             after = [nn.Identity()]
             if name == "text":
@@ -115,7 +116,8 @@ class ImageBind(nn.Module):
                 after += [Scale(5.0, learned=False)] if name == "touch" else []
             if name != "text":
                 self.modality_heads[name] = nn.Sequential(head[0], nn.Identity(), head[1])
-            depth, bias_kv = part.num_hidden_layers, name in ("audio", "touch")
+            depth = part.num_hidden_layers
+            bias_kv = name in ("audio", "touch")
             self.modality_trunks[name] = Trunk(width, part.num_attention_heads, depth, bias_kv, name == "vision")
             self.modality_postprocessors[name] = nn.Sequential(*after)
         generator = torch.Generator().manual_seed(0)

@@ -7,7 +7,9 @@ import numpy as np
 
 from tests.helpers.data_sets import painted, shade, write_attempts, write_image
 
-ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
+ONE = "20220601_182052"
+TWO = "20220602_101010"
+THREE = "20220603_090000"
 
 
 def write(folder: Path, files: dict) -> None:
@@ -25,12 +27,26 @@ def write(folder: Path, files: dict) -> None:
 def touch_and_go(folder: Path) -> None:
     for number, recording in enumerate((ONE, TWO, THREE)):
         for frame in range(3):
-            write(folder, {f"dataset/{recording}/gelsight_frame/{frame:010d}.jpg": 10 * number + frame,
-                           f"dataset/{recording}/video_frame/{frame:010d}.jpg": 40 + frame})  # fmt: skip
-    first, third = f"{ONE}/0000000000.jpg", f"{TWO}/0000000002.jpg"
+            write(
+                folder,
+                {
+                    f"dataset/{recording}/gelsight_frame/{frame:010d}.jpg": 10 * number + frame,
+                    f"dataset/{recording}/video_frame/{frame:010d}.jpg": 40 + frame,
+                },
+            )
+    first = f"{ONE}/0000000000.jpg"
+    third = f"{TWO}/0000000002.jpg"
     label = f"{first},3\n{ONE}/0000000001.jpg,-1\n{third}, 7\n{THREE}/0000000001.jpg,19\n"
-    write(folder, {"label.txt": label, "train.txt": f"{first},3\n", "test.txt": f"{third},7\n",
-                   "train_rough.txt": f"{first},1\n", "test_rough.txt": f"{third},-1\n"})  # fmt: skip
+    write(
+        folder,
+        {
+            "label.txt": label,
+            "train.txt": f"{first},3\n",
+            "test.txt": f"{third},7\n",
+            "train_rough.txt": f"{first},1\n",
+            "test_rough.txt": f"{third},-1\n",
+        },
+    )
 
 
 def feeling_of_success(folder: Path) -> None:
@@ -67,10 +83,21 @@ def object_folder_real(folder: Path) -> None:
 
 def ssvtp(folder: Path) -> None:
     for number in (1, 2, 30):
-        write(folder, {f"images_tac/image_{number}_tac.jpg": number, f"images_rgb/image_{number}_rgb.jpg": 10 + number,
-                       f"text/labels_{number}.txt": f"smooth, number {number}\n"})  # fmt: skip
-    write(folder, {f"{split}.csv": f"url,tactile\nimages_rgb/image_{number}_rgb.jpg,x\n"
-                   for split, number in (("train", 1), ("test", 30))})  # fmt: skip
+        write(
+            folder,
+            {
+                f"images_tac/image_{number}_tac.jpg": number,
+                f"images_rgb/image_{number}_rgb.jpg": 10 + number,
+                f"text/labels_{number}.txt": f"smooth, number {number}\n",
+            },
+        )
+    write(
+        folder,
+        {
+            f"{split}.csv": f"url,tactile\nimages_rgb/image_{number}_rgb.jpg,x\n"
+            for split, number in (("train", 1), ("test", 30))
+        },
+    )
 
 
 def hct(folder: Path) -> None:
@@ -78,8 +105,13 @@ def hct(folder: Path) -> None:
     for session in ("one", "two"):
         write(folder, {f"data1/{session}/background/0.jpg": 0})
         for number in range(3):
-            write(folder, {f"data1/{session}/tactile/{number}-0.5.jpg": 1 + number % 2,
-                           f"data1/{session}/vision/{number}-0.5.jpg": 63 - number})  # fmt: skip
+            write(
+                folder,
+                {
+                    f"data1/{session}/tactile/{number}-0.5.jpg": 1 + number % 2,
+                    f"data1/{session}/vision/{number}-0.5.jpg": 63 - number,
+                },
+            )
             picture, touch = (f"{session}/{place}/{number}-0.5.jpg" for place in ("vision", "tactile"))
             rows.append(f'{picture},{touch},{session}/background/0.jpg,"soft, {number}"')
     write(folder, {"data1/train.csv": "\n".join(rows)})
@@ -93,15 +125,28 @@ def tacquad(folder: Path) -> None:
 
 
 def table(folder: Path) -> None:
-    rows = ("touch,picture,background,sensor,material,object,caption,split,hardness",
-            'a.png,b.png,c.png,digit,wood,one,"rough, and hard",train,2',
-            "b.png,,c.png,gelsight,glass,two,smooth,test,-1", "c.png,b.png,,digit,,three,,train,10")  # fmt: skip
+    rows = (
+        "touch,picture,background,sensor,material,object,caption,split,hardness",
+        'a.png,b.png,c.png,digit,wood,one,"rough, and hard",train,2',
+        "b.png,,c.png,gelsight,glass,two,smooth,test,-1",
+        "c.png,b.png,,digit,,three,,train,10",
+    )
     write(folder, {"a.png": 0, "b.png": 1, "c.png": 2, "labels.csv": "\n".join(rows)})
 
 
 def tree(folder: Path) -> None:
-    write(folder, {"touch/wood/2.png": 2, "touch/wood/10.png": 10, "touch/wood/background.png": 40, "touch/11.png": 11,
-                   "picture/wood/2.jpg": 20, "picture/wood/10.png": 30, "background/wood/2.bmp": 41})  # fmt: skip
+    write(
+        folder,
+        {
+            "touch/wood/2.png": 2,
+            "touch/wood/10.png": 10,
+            "touch/wood/background.png": 40,
+            "touch/11.png": 11,
+            "picture/wood/2.jpg": 20,
+            "picture/wood/10.png": 30,
+            "background/wood/2.bmp": 41,
+        },
+    )
 
 
 def tree_of_splits(folder: Path) -> None:

@@ -16,16 +16,29 @@ def sizes(width: int = D) -> UniTouchConfig:
     """Sizes of encoders in ImageBind's layout."""
     shared = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "projection_dim": width}
     clip = {**shared, "intermediate_size": 128, "hidden_act": "gelu", "layer_norm_eps": 1e-6}
-    text = {"vocab_size": 600, "max_position_embeddings": 12, "bos_token_id": 598, "eos_token_id": 599,
-            "pad_token_id": 0}  # fmt: skip
+    text = {
+        "vocab_size": 600,
+        "max_position_embeddings": 12,
+        "bos_token_id": 598,
+        "eos_token_id": 599,
+        "pad_token_id": 0,
+    }
     return UniTouchConfig(
-        projection_dim=width, prototype_size=32,
+        projection_dim=width,
+        prototype_size=32,
         vision_config={**clip, "image_size": 32, "patch_size": 8},
         text_config={**clip, **text, "hidden_size": 48, "intermediate_size": 192},
         touch_config={**shared, "image_height": 32, "image_width": 32, "patch_size": 8, "patch_stride": 8},
-        audio_config={**shared, "image_height": 32, "image_width": 44, "num_channels": 1, "patch_size": 16,
-                      "patch_stride": 10, "stem_norm": True},
-    )  # fmt: skip
+        audio_config={
+            **shared,
+            "image_height": 32,
+            "image_width": 44,
+            "num_channels": 1,
+            "patch_size": 16,
+            "patch_stride": 10,
+            "stem_norm": True,
+        },
+    )
 
 
 def published(folder: Path, config: UniTouchConfig) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
@@ -64,11 +77,14 @@ def write_unclip(folder: Path, image_encoder: CLIPVisionModelWithProjection) -> 
 
 def inputs_of(config: UniTouchConfig) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(2)
-    side, text, audio = config.vision_config.image_size, config.text_config, config.audio_config
+    side = config.vision_config.image_size
+    text = config.text_config
+    audio = config.audio_config
     ids = torch.randint(1, text.vocab_size - 2, (3, text.max_position_embeddings), generator=generator)
     ids[:, 0] = text.vocab_size - 2
     for row, end in enumerate((4, 7, text.max_position_embeddings - 1)):
-        ids[row, end], ids[row, end + 1 :] = text.vocab_size - 1, 0
+        ids[row, end] = text.vocab_size - 1
+        ids[row, end + 1 :] = 0
     return {
         "image": torch.randn(3, 3, side, side, generator=generator),
         "text": ids,

@@ -15,7 +15,8 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel
 
 def write_small_family(folder: Path) -> None:
     """What `tiny` reads, of random weights, in the layers of the built-in family."""
-    joint, x_to_touch = folder / weights.JOINT.name, folder / weights.X_TO_TOUCH.name
+    joint = folder / weights.JOINT.name
+    x_to_touch = folder / weights.X_TO_TOUCH.name
     unclip = folder / weights.TOUCH_TO_IMAGE.name
     shutil.copytree(weights.JOINT, joint, ignore=shutil.ignore_patterns("*.safetensors"))
     width = 16
@@ -40,7 +41,8 @@ def write_small_family(folder: Path) -> None:
     StableUnCLIPImageNormalizer(embedding_dim=width).half().save_pretrained(unclip / "image_normalizer")
     (folder / "stylization").mkdir()
     shutil.copy(weights.FAMILY / "stylization" / "defaults.json", folder / "stylization")
-    language, parts = folder / weights.TOUCH_TO_TEXT.name, make_language_parts()
+    language = folder / weights.TOUCH_TO_TEXT.name
+    parts = make_language_parts()
     parts["language_bridge"].half().save_pretrained(language / "language_bridge")
     parts["language_model"].half().save_pretrained(language / "language_model")
     parts["tokenizer"].save_pretrained(language / "language_model")

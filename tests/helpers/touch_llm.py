@@ -8,14 +8,30 @@ from torch import Tensor
 from transformers import LlamaConfig, LlamaForCausalLM
 
 DIM, HEADS, LAYERS, HIDDEN, WIDTH, RANK = 32, 4, 2, 48, 16, 3
-SHAPES = {"attention.wq": (DIM, DIM), "attention.wk": (DIM, DIM), "attention.wv": (DIM, DIM),
-          "attention.wo": (DIM, DIM), "feed_forward.w1": (HIDDEN, DIM), "feed_forward.w2": (DIM, HIDDEN),
-          "feed_forward.w3": (HIDDEN, DIM)}  # fmt: skip
+SHAPES = {
+    "attention.wq": (DIM, DIM),
+    "attention.wk": (DIM, DIM),
+    "attention.wv": (DIM, DIM),
+    "attention.wo": (DIM, DIM),
+    "feed_forward.w1": (HIDDEN, DIM),
+    "feed_forward.w2": (DIM, HIDDEN),
+    "feed_forward.w3": (HIDDEN, DIM),
+}
 BIASED = ("wq", "wo", "w1", "w2", "w3")
-NAMES = {"tok_embeddings": "model.embed_tokens", "output": "lm_head", "layers": "model.layers", "norm": "model.norm",
-         "attention_norm": "input_layernorm", "ffn_norm": "post_attention_layernorm", "attention": "self_attn",
-         "feed_forward": "mlp", "w1": "gate_proj", "w2": "down_proj", "w3": "up_proj",
-         **{f"w{one}": f"{one}_proj" for one in "qkvo"}}  # fmt: skip
+NAMES = {
+    "tok_embeddings": "model.embed_tokens",
+    "output": "lm_head",
+    "layers": "model.layers",
+    "norm": "model.norm",
+    "attention_norm": "input_layernorm",
+    "ffn_norm": "post_attention_layernorm",
+    "attention": "self_attn",
+    "feed_forward": "mlp",
+    "w1": "gate_proj",
+    "w2": "down_proj",
+    "w3": "up_proj",
+    **{f"w{one}": f"{one}_proj" for one in "qkvo"},
+}
 
 
 def files_of(folder: Path, vocabulary: int, legacy: bool) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -25,10 +41,17 @@ def files_of(folder: Path, vocabulary: int, legacy: bool) -> tuple[dict[str, Ten
     def random(*shape: int, scale: float = 0.3) -> Tensor:
         return scale * torch.randn(shape, generator=generator)
 
-    llama = {"tok_embeddings.weight": random(vocabulary, DIM, scale=1.0), "output.weight": random(vocabulary, DIM),
-             "norm.weight": 1 + random(DIM)}  # fmt: skip
-    bridge = {"image_bind_proj.weight": random(DIM, WIDTH), "image_bind_proj.bias": random(DIM),
-              "prefix_query.weight": random(LAYERS, DIM), "llama.norm.weight": 1 + random(DIM)}  # fmt: skip
+    llama = {
+        "tok_embeddings.weight": random(vocabulary, DIM, scale=1.0),
+        "output.weight": random(vocabulary, DIM),
+        "norm.weight": 1 + random(DIM),
+    }
+    bridge = {
+        "image_bind_proj.weight": random(DIM, WIDTH),
+        "image_bind_proj.bias": random(DIM),
+        "prefix_query.weight": random(LAYERS, DIM),
+        "llama.norm.weight": 1 + random(DIM),
+    }
     for k in (1, 2, 3):
         bridge[f"image_bind_norm_{k}.weight"] = 1 + random(DIM)
         for name, shape in {"f1": (HIDDEN, DIM), "f2": (DIM, HIDDEN), "f3": (HIDDEN, DIM)}.items():
@@ -74,7 +97,8 @@ def visual(w: dict[str, Tensor], embeds: Tensor) -> Tensor:
     """F' (B, 1, DIM) of embeddings (B, WIDTH)."""
     x = F.linear(F.normalize(embeds, dim=-1)[:, None], w["image_bind_proj.weight"], w["image_bind_proj.bias"])
     for k in (1, 2, 3):
-        norm, bias = w[f"image_bind_norm_{k}.weight"], w.get(f"image_bind_norm_{k}.bias")
+        norm = w[f"image_bind_norm_{k}.weight"]
+        bias = w.get(f"image_bind_norm_{k}.bias")
         n = rms(x, norm, 1e-6) if bias is None else F.layer_norm(x, (DIM,), norm, bias)
         f1, f2, f3 = ((w[f"image_bind_f{i}_{k}.weight"], w.get(f"image_bind_f{i}_{k}.bias")) for i in (1, 2, 3))
         x = x + F.linear(F.silu(F.linear(n, *f1)) * F.linear(n, *f3), *f2)

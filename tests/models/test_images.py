@@ -21,7 +21,8 @@ def smooth(height: int, width: int, seed: int = 0) -> np.ndarray:
     return np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC))
 
 
-PICTURE, ALPHA = smooth(32, 32), smooth(32, 32, seed=2)[..., 0]
+PICTURE = smooth(32, 32)
+ALPHA = smooth(32, 32, seed=2)[..., 0]
 TENSOR = torch.from_numpy(PICTURE.copy()).permute(2, 0, 1)
 NOISE = np.random.default_rng(0).integers(0, 256, (24, 20, 3), dtype=np.uint8)
 
@@ -53,7 +54,8 @@ def test_every_kind_gives_the_same_pixels(processor: UniTouchProcessor) -> None:
 
 
 def test_a_list_of_many_kinds_is_one_batch_in_order(processor: UniTouchProcessor, tmp_path: Path) -> None:
-    other, file = smooth(40, 50, seed=1), tmp_path / "picture.png"
+    other = smooth(40, 50, seed=1)
+    file = tmp_path / "picture.png"
     Image.fromarray(PICTURE).save(file)
     batch = processor.raw_images([PICTURE, Image.fromarray(other), TENSOR[None], str(file), Image.open(file)])
     assert batch.shape == (5, 3, 32, 32)
@@ -108,12 +110,15 @@ def test_colours_are_those_of_the_profile(processor: UniTouchProcessor, tmp_path
 
 
 def test_grey_bilevel_and_deep_images_are_the_same_in_all_channels(processor: UniTouchProcessor, tmp_path) -> None:
-    grey, mask = PICTURE[..., 0], PICTURE[..., 0] > 128
+    grey = PICTURE[..., 0]
+    mask = PICTURE[..., 0] > 128
     deep = np.linspace(0, 65535, 32 * 32).reshape(32, 32).astype(np.uint16)
     Image.fromarray(deep).save(tmp_path / "deep.png")
-    expected = [(grey / 255, [Image.fromarray(grey), grey, torch.from_numpy(grey.copy())[None]]),
-                (mask, [Image.fromarray(mask), mask, torch.from_numpy(mask)[None]]),
-                (deep / 65535, [tmp_path / "deep.png"])]  # fmt: skip
+    expected = [
+        (grey / 255, [Image.fromarray(grey), grey, torch.from_numpy(grey.copy())[None]]),
+        (mask, [Image.fromarray(mask), mask, torch.from_numpy(mask)[None]]),
+        (deep / 65535, [tmp_path / "deep.png"]),
+    ]
     for values, kinds in expected:
         for given in kinds:
             torch.testing.assert_close(processor.raw_images(given), pixels_of(values), rtol=0, atol=1e-5)
@@ -150,7 +155,8 @@ def test_deep_colours_are_their_upper_byte(processor: UniTouchProcessor, tmp_pat
 
 
 def test_a_photo_that_moves_is_its_first_frame_and_told(processor: UniTouchProcessor, tmp_path: Path) -> None:
-    first, other = Image.fromarray(PICTURE), Image.fromarray(255 - PICTURE)
+    first = Image.fromarray(PICTURE)
+    other = Image.fromarray(255 - PICTURE)
     first.save(tmp_path / "photo.png", save_all=True, append_images=[other])
     with pytest.warns(UserWarning, match="has 2 frames"):
         found = processor.touch(tmp_path / "photo.png")
@@ -168,8 +174,10 @@ def test_a_camera_held_sideways_is_turned_back(processor: UniTouchProcessor, tmp
 
 def test_what_a_png_holds_beside_its_picture_does_not_matter(processor: UniTouchProcessor, tmp_path: Path) -> None:
     """Texts of megabytes, before the pixels and after them, a large colour profile, and broken EXIF."""
-    text, srgb = zlib.compress(bytes(4 << 20)), ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    whole, file = encoded(Image.fromarray(PICTURE)), tmp_path / "workflow.png"
+    text = zlib.compress(bytes(4 << 20))
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    whole = encoded(Image.fromarray(PICTURE))
+    file = tmp_path / "workflow.png"
     for beside in (
         chunk(b"zTXt", b"workflow\0\0" + text),
         chunk(b"iTXt", b"prompt\0\1\0\0\0" + text),

@@ -31,7 +31,8 @@ def features(model: UniTouchModel, modality: str, inputs: dict) -> Tensor:
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_features_are_the_same_alone_and_in_a_batch(model, inputs, modality) -> None:
     embeds = features(model, modality, inputs)
-    assert embeds.shape == (2, 16) and torch.isfinite(embeds).all()
+    assert embeds.shape == (2, 16)
+    assert torch.isfinite(embeds).all()
     alone = {modality: {key: value[1:] for key, value in inputs[modality].items()}}
     torch.testing.assert_close(features(model, modality, alone)[0], embeds[1], rtol=1e-5, atol=1e-5)
 
@@ -59,7 +60,8 @@ def test_audio_features_are_the_mean_of_normalised_clips(model: UniTouchModel, i
 
 
 def test_touch_features_are_the_trunk_with_the_sensors_tokens(model: UniTouchModel, inputs: dict) -> None:
-    pixels, ids = inputs["touch"]["pixel_values"], torch.tensor([2, 0])
+    pixels = inputs["touch"]["pixel_values"]
+    ids = torch.tensor([2, 0])
     expected = model.touch_model(pixels, model.sensor_bank.tokens[ids])
     torch.testing.assert_close(model.get_touch_features(pixels, ids.to(torch.uint8)), expected)
     assert not torch.allclose(model.get_touch_features(pixels, torch.tensor([1, 1])), expected, atol=1e-3)
@@ -72,7 +74,8 @@ def test_touch_features_are_the_trunk_with_the_sensors_tokens(model: UniTouchMod
 
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_an_encoder_is_read_when_first_used_and_is_what_was_saved(model, folder, inputs, modality) -> None:
-    before, again = torch.get_rng_state(), UniTouchModel.from_pretrained(folder)
+    before = torch.get_rng_state()
+    again = UniTouchModel.from_pretrained(folder)
     assert not again.state_dict()
     torch.testing.assert_close(features(again, modality, inputs), features(model, modality, inputs), rtol=0, atol=0)
     assert {key.split(".")[0] for key in again.state_dict()} == set(MODULES[modality])
@@ -81,7 +84,8 @@ def test_an_encoder_is_read_when_first_used_and_is_what_was_saved(model, folder,
 
 
 def test_threads_that_share_a_model_read_each_encoder_once_and_get_what_serial_calls_get(model, folder, inputs) -> None:
-    shared, asked = UniTouchModel.from_pretrained(folder), MODALITIES * 8
+    shared = UniTouchModel.from_pretrained(folder)
+    asked = MODALITIES * 8
 
     def used(modality: str) -> tuple[int, Tensor]:
         with torch.inference_mode():
@@ -101,7 +105,8 @@ def test_saving_over_its_own_folder_and_elsewhere_keeps_every_tensor(folder, tmp
     for place in (folder, tmp_path / "copy"):
         model.save_pretrained(place)
         after = load_file(place / "model.safetensors")
-        assert before.keys() == after.keys() and all(torch.equal(before[key], after[key]) for key in before)
+        assert before.keys() == after.keys()
+        assert all(torch.equal(before[key], after[key]) for key in before)
 
 
 def test_other_parts_are_saved_beside_shards_and_shards_give_way_to_other_shards(
@@ -117,7 +122,8 @@ def test_other_parts_are_saved_beside_shards_and_shards_give_way_to_other_shards
     assert UniTouchProcessor.from_pretrained(tmp_path).tokenizer.get_vocab() == tokenizer.get_vocab()
     weights = {file.name for file in tmp_path.glob("*.safetensors*")}
     shards = {name for name in weights if re.fullmatch(r"model-\d+-of-\d+\.safetensors", name)}
-    assert len(shards) > 1 and len({name.rpartition("-")[2] for name in shards}) == 1
+    assert len(shards) > 1
+    assert len({name.rpartition("-")[2] for name in shards}) == 1
     others = {"controlnet.safetensors", "model.fp16.safetensors", "model.safetensors.index.json"}
     assert weights - shards == others
 

@@ -13,11 +13,15 @@ IDS = torch.randint(3, 250, (3, 6), generator=torch.Generator().manual_seed(0))
 EMBEDS = torch.randn(3, D, generator=torch.Generator().manual_seed(1))
 TOKENS = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2, "vocab_size": 280}
 MODES = {
-    "greedy": {"do_sample": False}, "sampling": {"do_sample": True, "temperature": 0.7, "top_p": 0.9},
-    "beams": {"num_beams": 3, "num_return_sequences": 2}, "beam sampling": {"num_beams": 2, "do_sample": True},
-    "several": {"do_sample": True, "num_return_sequences": 3}, "no cache": {"use_cache": False},
-    "static cache": {"cache_implementation": "static"}, "guidance": {"guidance_scale": 2.0},
-}  # fmt: skip
+    "greedy": {"do_sample": False},
+    "sampling": {"do_sample": True, "temperature": 0.7, "top_p": 0.9},
+    "beams": {"num_beams": 3, "num_return_sequences": 2},
+    "beam sampling": {"num_beams": 2, "do_sample": True},
+    "several": {"do_sample": True, "num_return_sequences": 3},
+    "no cache": {"use_cache": False},
+    "static cache": {"cache_implementation": "static"},
+    "guidance": {"guidance_scale": 2.0},
+}
 
 
 def model_of(kind, **sizes):
@@ -61,15 +65,18 @@ def test_what_is_added_is_the_gated_value_of_an_adapter_token(parts):
 @torch.no_grad()
 def test_closed_gates_and_closing_leave_every_bit_and_open_gates_do_not(parts, mode, dtype):
     bridge, model = (part.to(dtype) for part in parts)
-    before, logits = generate(model, **MODES[mode]), model(IDS).logits
+    before = generate(model, **MODES[mode])
+    logits = model(IDS).logits
     with bridge.attach(model, EMBEDS):
         assert not torch.equal(model(IDS).logits, logits)
         open_ = generate(model, **MODES[mode])
     bridge.gates.zero_()
     attached = bridge.attach(model, EMBEDS)
-    assert torch.equal(generate(model, **MODES[mode]), before) and torch.equal(model(IDS).logits, logits)
+    assert torch.equal(generate(model, **MODES[mode]), before)
+    assert torch.equal(model(IDS).logits, logits)
     attached.close()
-    assert torch.equal(model(IDS).logits, logits) and not torch.equal(open_, before)
+    assert torch.equal(model(IDS).logits, logits)
+    assert not torch.equal(open_, before)
     assert not any(module._forward_pre_hooks for module in model.modules())
 
 

@@ -25,7 +25,8 @@ def scene():
 def test_pictures_are_unknown_and_touches_are_not(scene, dtype, tmp_path) -> None:
     """Of sensors that the encoder was not trained on, too; and as saved again."""
     UniTouchModel.from_pretrained(weights.JOINT, dtype=dtype).save_pretrained(tmp_path)
-    model, processor = UniTouchModel.from_pretrained(tmp_path), UniTouchProcessor.from_pretrained(weights.JOINT)
+    model = UniTouchModel.from_pretrained(tmp_path)
+    processor = UniTouchProcessor.from_pretrained(weights.JOINT)
     for pictures, low, high in ((scene.image, 0.7, 1.0), *((touch, 0.0, 0.15) for touch in scene.touch.values())):
         reasons = model.encode_touches(processor.touch(pictures))[1]
         assert set(reasons) <= {None, "unlike anything known"}
@@ -50,7 +51,8 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     grey = noise[:, :1].expand(-1, 3, -1, -1)
     pixels = normalise_pixels(torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
     statistics = touch_statistics(torch.ones(3, 2, 4, 4), pixels)
-    assert (statistics[:, :2] == 1.0).all() and bool(torch.isfinite(statistics).all())
+    assert (statistics[:, :2] == 1.0).all()
+    assert bool(torch.isfinite(statistics).all())
     statistics = statistics[:, 2:]
     expected = np.corrcoef(mixed.flatten(2)[0].numpy())[[0, 0, 1], [1, 2, 2]]
     np.testing.assert_allclose(statistics[0, 6:9], expected, atol=0.03)  # noise is detail, all but a little

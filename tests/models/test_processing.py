@@ -11,13 +11,16 @@ from unitouch_gen.models import UniTouchProcessor
 
 def test_text_becomes_padded_ids_between_start_and_end(processor: UniTouchProcessor, tokenizer: CLIPTokenizer) -> None:
     encoded = processor.text(["Rough  BRICK ", "rough brick " * 100, "🧱 {}[]<|endoftext|>", ""])
-    ids, length = encoded["input_ids"][0].tolist(), int(encoded["attention_mask"][0].sum())
+    ids = encoded["input_ids"][0].tolist()
+    length = int(encoded["attention_mask"][0].sum())
     assert encoded["input_ids"].shape == (4, 12)
-    assert ids[0] == tokenizer.bos_token_id and ids[length - 1] == tokenizer.eos_token_id
+    assert ids[0] == tokenizer.bos_token_id
+    assert ids[length - 1] == tokenizer.eos_token_id
     assert set(ids[length:]) == {tokenizer.pad_token_id}
     assert tokenizer.decode(ids, skip_special_tokens=True).strip() == "rough brick"
     assert encoded["input_ids"][1, -1] == tokenizer.eos_token_id  # cut
-    assert encoded["input_ids"].min() >= 0 and encoded["input_ids"].max() < len(tokenizer)
+    assert encoded["input_ids"].min() >= 0
+    assert encoded["input_ids"].max() < len(tokenizer)
 
 
 def letters(text: str) -> str:

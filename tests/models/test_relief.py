@@ -16,7 +16,8 @@ def bumps(seed: int, height: int = 128, width: int = 128, count: int = 40) -> tu
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     at = torch.rand(count, 2, generator=rng) * torch.tensor([width, height])
     wide = (2.5 + 2.5 * torch.rand(count, 1, 1, generator=rng)) * min(height, width) / 128
-    dx, dy = x - at[:, :1, None], y - at[:, 1:, None]
+    dx = x - at[:, :1, None]
+    dy = y - at[:, 1:, None]
     each = torch.exp(-(dx**2 + dy**2) / (2 * wide**2))
     return each.sum(0), torch.stack([(-dx / wide**2 * each).sum(0), (-dy / wide**2 * each).sum(0)])
 
@@ -41,7 +42,8 @@ def test_slopes_and_heights_come_back_whatever_the_lamps_are(size: tuple[int, in
     for seed in range(4):
         heights, slopes = bumps(seed, *size)
         found = relief(shaded(slopes, seed))[0]
-        assert alike(found[0], slopes[0]) > 0.95 and alike(found[1], slopes[1]) > 0.95
+        assert alike(found[0], slopes[0]) > 0.95
+        assert alike(found[1], slopes[1]) > 0.95
         assert alike(found[2], heights) > 0.8  # what is wider than the window is left out
         assert all(0.4 < deviation < 2.5 for deviation in found.flatten(1).std(dim=1))
 
@@ -68,9 +70,12 @@ def test_a_broken_pixel_spoils_no_other_touch() -> None:
 
 def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
     """The world's own depths, less what is wide in them."""
-    world, count, found = World(seed=3), len(MATERIAL_NAMES), []
+    world = World(seed=3)
+    count = len(MATERIAL_NAMES)
+    found = []
     for number in range(4):
-        names, wanted = (list(range(count)), [number] * count, [0] * count), ("touch", "depth")
+        names = (list(range(count)), [number] * count, [0] * count)
+        wanted = ("touch", "depth")
         scene = world.render(*names, modalities=wanted, sensors=[draw_sensor(3, number)])
         (touch,), (depth,) = scene.touch.values(), scene.depth.values()
         detail = depth - torch.from_numpy(gaussian_filter(depth.numpy(), (0, 8, 8)))

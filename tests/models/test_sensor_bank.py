@@ -23,7 +23,8 @@ def levels(*values: float) -> torch.Tensor:
 
 def test_retrieval_is_the_smallest_mean_absolute_difference() -> None:
     torch.manual_seed(0)
-    bank, images = SensorBank(NAMES, 5, 16, 8), torch.rand(20, 3, 8, 8)
+    bank = SensorBank(NAMES, 5, 16, 8)
+    images = torch.rand(20, 3, 8, 8)
     for name in NAMES:
         bank.set_prototype(name, torch.rand(3, 8, 8))
     gaps = np.abs(images.numpy()[:, None] - torch.stack([bank.prototype(name) for name in NAMES]).numpy()[None])
@@ -35,7 +36,8 @@ def test_retrieval_is_the_smallest_mean_absolute_difference() -> None:
 
 
 def test_sensors_without_prototypes_are_named_but_never_retrieved() -> None:
-    bank, black = SensorBank(NAMES, 5, 16, 8), torch.zeros(1, 3, 8, 8)
+    bank = SensorBank(NAMES, 5, 16, 8)
+    black = torch.zeros(1, 3, 8, 8)
     assert bank.match(black, "digit") == [SensorMatch("digit", None)]
     bank.set_prototype("taxim", torch.ones(3, 8, 8))
     assert bank.match(black) == [SensorMatch("taxim", 1.0)]  # unset ones are zeros: nearer, but unknown

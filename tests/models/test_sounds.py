@@ -32,7 +32,9 @@ def reference(samples: np.ndarray, bins: int, number: int) -> list[float]:
 
     After torchaudio's documentation and Kaldi's feature-window.cc, feature-fbank.cc and mel-computations.cc.
     """
-    lowest, width, energies = mel(20.0), (mel(RATE / 2) - mel(20.0)) / (bins + 1), []
+    lowest = mel(20.0)
+    width = (mel(RATE / 2) - mel(20.0)) / (bins + 1)
+    energies = []
     frame = [float(value) for value in samples[number * 160 : number * 160 + 400]]
     frame = [value - sum(frame) / 400 for value in frame]  # remove_dc_offset
     frame = [value - 0.97 * frame[max(i - 1, 0)] for i, value in enumerate(frame)]  # preemphasis_coefficient
@@ -71,11 +73,15 @@ def test_the_paper_takes_three_clips_evenly_over_the_sound_and_warns_of_nothing(
 
 
 def test_short_sounds_are_padded_before_scaling() -> None:
-    clips, frames = LogMel()(Sound(NOISE[:4000], RATE)), 1 + (4000 - 400) // 160
-    assert torch.equal(clips[0], clips[1]) and torch.equal(clips[0], clips[2])
+    clips = LogMel()(Sound(NOISE[:4000], RATE))
+    frames = 1 + (4000 - 400) // 160
+    assert torch.equal(clips[0], clips[1])
+    assert torch.equal(clips[0], clips[2])
     torch.testing.assert_close(clips[0, 0, :, frames:], torch.full((128, 204 - frames), 4.268) / 9.138)
     one = LogMel(clips=1, frames=3, **RAW)(Sound(NOISE[:50], RATE))[0, 0]  # shorter than a frame
-    assert torch.isfinite(one).all() and (one[:, 0] != 0).any() and (one[:, 1:] == 0).all()
+    assert torch.isfinite(one).all()
+    assert (one[:, 0] != 0).any()
+    assert (one[:, 1:] == 0).all()
 
 
 def test_any_loudness_gives_finite_values_and_silence_the_floor() -> None:
@@ -99,13 +105,19 @@ def test_a_tone_of_another_rate_is_heard_at_the_same_pitch() -> None:
 def test_every_kind_of_samples_gives_the_same_sound() -> None:
     integers = (NOISE.astype(np.float64) * np.iinfo(np.int32).max).astype(np.int32)
     kinds = [
-        (NOISE, RATE), (torch.from_numpy(NOISE).requires_grad_(), RATE), (NOISE.astype(np.float64), RATE),
-        (np.stack([NOISE - 0.1, NOISE + 0.1]), RATE), (NOISE.astype(">f4"), np.int64(RATE)), (integers, RATE),
-        (torch.from_numpy(integers), RATE), (torch.from_numpy(NOISE).bfloat16(), RATE),
-    ]  # fmt: skip
+        (NOISE, RATE),
+        (torch.from_numpy(NOISE).requires_grad_(), RATE),
+        (NOISE.astype(np.float64), RATE),
+        (np.stack([NOISE - 0.1, NOISE + 0.1]), RATE),
+        (NOISE.astype(">f4"), np.int64(RATE)),
+        (integers, RATE),
+        (torch.from_numpy(integers), RATE),
+        (torch.from_numpy(NOISE).bfloat16(), RATE),
+    ]
     sounds = load_sounds("audio", kinds)
     for sound in sounds:
-        assert sound.rate == RATE and sound.samples.dtype == np.float32
+        assert sound.rate == RATE
+        assert sound.samples.dtype == np.float32
         np.testing.assert_allclose(sound.samples, NOISE, atol=1e-6 if sound is not sounds[-1] else 4e-3)
 
 
@@ -118,7 +130,8 @@ def test_full_scale_of_wide_integers_is_that_of_the_bits_they_use(dtype: str, bi
 
 @pytest.mark.parametrize("suffix", ["wav", "flac", "ogg", "mp3"])
 def test_a_file_is_read_with_its_rate_and_channels(suffix: str, tmp_path: Path) -> None:
-    left, right = 0.5 * tone(300.0, 0.5, 22_050), 0.5 * tone(700.0, 0.5, 22_050)
+    left = 0.5 * tone(300.0, 0.5, 22_050)
+    right = 0.5 * tone(700.0, 0.5, 22_050)
     file = tmp_path / f"\udcff.{suffix}"  # bytes that are no UTF-8, as Latin-1 leaves them
     soundfile.write(str(tmp_path / f"hit.{suffix}"), np.stack([left, right], axis=1), 22_050)
     (tmp_path / f"hit.{suffix}").rename(file)

@@ -48,8 +48,11 @@ def with_texture() -> UniTouchModel:
 
 
 def test_texture_is_added_to_embeddings(tmp_path: Path) -> None:
-    pixels, ids, model = torch.randn(2, 3, 32, 32), torch.tensor([-1, -1]), with_texture()
-    image, touch = model.vision_model.texture, model.touch_model.texture
+    pixels = torch.randn(2, 3, 32, 32)
+    ids = torch.tensor([-1, -1])
+    model = with_texture()
+    image = model.vision_model.texture
+    touch = model.touch_model.texture
     model.vision_model.texture = model.touch_model.texture = None
     plain = model.get_image_features(pixels), model.get_touch_features(pixels, ids)
     model.vision_model.texture, model.touch_model.texture = image, touch

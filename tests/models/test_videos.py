@@ -55,7 +55,9 @@ def test_a_simulation_without_noise_is_not_frozen():
 
 def test_the_gel_at_rest_is_found_wherever_it_is_in_a_recording():
     images = list(recordings.frames())
-    rest, rise, held = images[:8], images[8:FIRMEST], list(recordings.frames(presses=6))[FIRMEST::40]
+    rest = images[:8]
+    rise = images[8:FIRMEST]
+    held = list(recordings.frames(presses=6))[FIRMEST::40]
     for order in ([held, rise[::-1], rest], [rest, rise, held], [held, rise[::-1], rest, rise, held]):
         recording = [image for part in order for image in part]
         assert np.abs(recording[place_of_firmest(recording)] - images[FIRMEST].astype(int)).mean() < 3
@@ -79,10 +81,12 @@ def test_a_recording_that_does_not_tell_what_rests_is_named():
 
 def test_a_video_is_its_frames_and_a_touch(tmp_path):
     pytest.importorskip("av")
-    file, images = tmp_path / "press.mp4", list(recordings.frames())
+    file = tmp_path / "press.mp4"
+    images = list(recordings.frames())
     recordings.write(file, images)
     assert len(list(read_video("touch", file))) == len(images)
-    found, processor = firmest("touch", file), UniTouchProcessor(image_size=32)
+    found = firmest("touch", file)
+    processor = UniTouchProcessor(image_size=32)
     assert found.dtype == torch.uint8
     assert abs(found.permute(1, 2, 0).numpy().astype(int) - images[FIRMEST]).mean() < 3
     expected = processor.touch([found, images[place_of_firmest(images)]])
@@ -92,10 +96,11 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
 @pytest.mark.parametrize(
     ("matrix", "turned"),
     [
-        ((0, 1, -1, 0), lambda frame: np.rot90(frame, -1)), ((0, -1, 1, 0), np.rot90),
+        ((0, 1, -1, 0), lambda frame: np.rot90(frame, -1)),
+        ((0, -1, 1, 0), np.rot90),
         ((-1, 0, 0, -1), lambda frame: np.rot90(frame, 2)),
     ],
-)  # fmt: skip
+)
 def test_a_video_is_turned_as_its_container_says(tmp_path, matrix, turned):
     """And its name is no address."""
     pytest.importorskip("av")

@@ -13,13 +13,22 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from unitouch_gen.models import StemmedCLIPVisionModel, UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
 from unitouch_gen.models.vit import LocalContrast
 
-TINY = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "image_height": 24, "image_width": 40,
-        "patch_size": 8, "patch_stride": 8, "projection_dim": 12}  # fmt: skip
+TINY = {
+    "hidden_size": 32,
+    "num_hidden_layers": 3,
+    "num_attention_heads": 4,
+    "image_height": 24,
+    "image_width": 40,
+    "patch_size": 8,
+    "patch_stride": 8,
+    "projection_dim": 12,
+}
 
 
 def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefix: Tensor | None) -> Tensor:
     """The same network written with `nn.MultiheadAttention(add_bias_kv=True)` and unfolded patches."""
-    weights, width = vit.state_dict(), config.hidden_size
+    weights = vit.state_dict()
+    width = config.hidden_size
     patches = F.unfold(pixels, config.patch_size, stride=config.patch_stride).transpose(1, 2)
     x = patches @ weights["stem.weight"].flatten(1).T
     if config.stem_norm:
@@ -33,8 +42,9 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
         return F.layer_norm(x, (width,), weights[f"{key}.weight"], weights[f"{key}.bias"], config.layer_norm_eps)
 
     for i in range(config.num_hidden_layers):
-        attention = nn.MultiheadAttention(width, config.num_attention_heads, add_bias_kv=config.add_bias_kv,
-                                          batch_first=True, dtype=pixels.dtype).eval()  # fmt: skip
+        attention = nn.MultiheadAttention(
+            width, config.num_attention_heads, add_bias_kv=config.add_bias_kv, batch_first=True, dtype=pixels.dtype
+        ).eval()
         place = f"blocks.{i}.attention."
         attention.load_state_dict({key.removeprefix(place): weights[key] for key in weights if key.startswith(place)})
         normed = norm(x, f"blocks.{i}.norm_1")
@@ -51,8 +61,17 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("changes", [{}, {"add_bias_kv": False}, {"stem_norm": True}, {"patch_stride": 4},
-                                     {"num_channels": 1, "mlp_ratio": 2.0}, {"patch_channels": 6}])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"add_bias_kv": False},
+        {"stem_norm": True},
+        {"patch_stride": 4},
+        {"num_channels": 1, "mlp_ratio": 2.0},
+        {"patch_channels": 6},
+    ],
+)
 def test_features_equal_those_of_torchs_attention(changes: dict) -> None:
     torch.manual_seed(0)
     config = UniTouchViTConfig(**{**TINY, **changes})
@@ -70,10 +89,13 @@ def test_convolutional_stems_make_the_same_grid_as_patches_and_serve_half_precis
     for patch in (2, 4, 8):
         torch.manual_seed(0)
         changes = {"patch_size": patch, "patch_stride": patch, "stem": stem}
-        vit, pixels = UniTouchViT(UniTouchViTConfig(**TINY | changes)).eval(), torch.randn(2, 3, 24, 40)
+        vit = UniTouchViT(UniTouchViTConfig(**TINY | changes)).eval()
+        pixels = torch.randn(2, 3, 24, 40)
         assert vit.tokens(vit.stem(pixels)).shape == (2, 1 + 24 * 40 // patch**2, 32)
-        exact, rounded = vit(pixels), vit.bfloat16()(pixels.bfloat16()).float()
-        assert exact.shape == (2, 12) and F.cosine_similarity(exact, rounded).min() > 0.97
+        exact = vit(pixels)
+        rounded = vit.bfloat16()(pixels.bfloat16()).float()
+        assert exact.shape == (2, 12)
+        assert F.cosine_similarity(exact, rounded).min() > 0.97
 
 
 def test_local_contrast_is_detail_over_its_deviation() -> None:
@@ -117,8 +139,15 @@ def test_the_default_encoders_have_the_published_sizes_and_shapes() -> None:
     assert paper.sensor_bank.tokens.shape == (3, 5, 1024)
 
 
-SIZES = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 32,
-         "patch_size": 8, "projection_dim": 16}  # fmt: skip
+SIZES = {
+    "hidden_size": 32,
+    "intermediate_size": 64,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "image_size": 32,
+    "patch_size": 8,
+    "projection_dim": 16,
+}
 
 
 def trained(model: torch.nn.Module) -> torch.nn.Module:
@@ -130,7 +159,8 @@ def trained(model: torch.nn.Module) -> torch.nn.Module:
 
 @torch.no_grad()
 def test_only_the_patches_and_their_mean_differ_from_transformers_own() -> None:
-    model, pixels = trained(StemmedCLIPVisionModel(CLIPVisionConfig(**SIZES))), torch.randn(3, 3, 32, 32)
+    model = trained(StemmedCLIPVisionModel(CLIPVisionConfig(**SIZES)))
+    pixels = torch.randn(3, 3, 32, 32)
     reference = CLIPVisionModelWithProjection(CLIPVisionConfig(**SIZES)).eval()
     own = {name: value for name, value in model.state_dict().items() if ".patch_embedding." not in name}
     missing = reference.load_state_dict(own, strict=False).missing_keys
@@ -150,7 +180,8 @@ def test_only_the_patches_and_their_mean_differ_from_transformers_own() -> None:
 def test_it_is_saved_and_read_alone_and_in_a_joint_space(config: UniTouchConfig, tmp_path: Path) -> None:
     parts = {f"{name}_config": getattr(config, f"{name}_config") for name in ("text", "touch", "audio")}
     model = UniTouchModel(UniTouchConfig(vision_config={**SIZES, "stem": "residual"}, projection_dim=16, **parts))
-    pixels, encoder = torch.randn(2, 3, 32, 32), trained(model.vision_model)
+    pixels = torch.randn(2, 3, 32, 32)
+    encoder = trained(model.vision_model)
     expected = encoder(pixels).image_embeds
     encoder.save_pretrained(tmp_path / "alone")
     model.save_pretrained(tmp_path / "joint")

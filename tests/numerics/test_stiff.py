@@ -19,7 +19,9 @@ from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import SOLVERS, ReturnCode, prepare_steps
 from unitouch_gen.solvers import MIN_LEVEL_RATIO
 
-SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
+SUCCESS = ReturnCode.SUCCESS
+NON_FINITE = ReturnCode.NON_FINITE
+DIVERGED = ReturnCode.DIVERGED
 
 KINDS = ("touch-to-image", "stylization", "x-to-touch")
 
@@ -54,7 +56,8 @@ def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> fl
     slopes = values.diff(dim=0) / steps
     local = steps**2 / 2 * slopes.abs()
     if higher:
-        before, after = steps[:-1], steps[1:]
+        before = steps[:-1]
+        after = steps[1:]
         curvatures = 2 * slopes.diff(dim=0) / (before + after)
         local[1:] = (after**3 / 6 + after**2 * before / 4) * (curvatures.abs() + 2 * slopes[1:].abs())
     at_the_end = (carried(problem, sigmas[1:, None])[:, None] * local).sum(dim=0)
@@ -108,7 +111,8 @@ def solve(
     `way` is a solver with steps, or a tolerance; `change` is made to the predictions of the exact network, to all or
     `at` one evaluation.
     """
-    network, calls = problem.network(4), count()
+    network = problem.network(4)
+    calls = count()
 
     def predict(z: Tensor, timestep: Tensor) -> Tensor:
         prediction = network(z, timestep)
@@ -121,14 +125,17 @@ def solve(
 
 def bounded(name: str, problem: Problem, **way: Any) -> Case:
     """One run on a problem, with the bound that follows from it."""
-    words, run = way.get("solver", f"tolerance {way.get('tolerance', 0):g}"), partial(solve, problem, **way)
+    words = way.get("solver", f"tolerance {way.get('tolerance', 0):g}")
+    run = partial(solve, problem, **way)
     size = (problem.data.means**2 + problem.data.variances).mean().sqrt().item()  # RMS of a coordinate of x_0
     bound: float | Callable[[], float] = 3 * problem.smallest_deviation / size + 50 * ROUNDING
     reason = "both within 1.5 deviations of a mode"
     if "tolerance" in way:
-        bound, reason = partial(within, problem, **way), "tolerance, and the step to sigma 0"
+        bound = partial(within, problem, **way)
+        reason = "tolerance, and the step to sigma 0"
     elif problem.is_gaussian:
-        bound, reason = partial(a_priori, problem, **way), "order along the exact flow"
+        bound = partial(a_priori, problem, **way)
+        reason = "order along the exact flow"
     return Case(f"{name}, {words}", run, bound, reason)
 
 
@@ -140,7 +147,8 @@ def solver_cases() -> Iterator[Case]:
     for tolerance in (1.0, 0.1, 1e-3):
         yield bounded("mixture-7.5", PROBLEMS["mixture-7.5"], tolerance=tolerance)
 
-    plain, guided = PROBLEMS["conditioning-1e2"], PROBLEMS["gaussian-guided"]
+    plain = PROBLEMS["conditioning-1e2"]
+    guided = PROBLEMS["gaussian-guided"]
     little = {"beta_schedule": "linear", "beta_start": 1e-6, "beta_end": 2e-5}
     extremes: dict[str, tuple[Problem, int]] = {  # with steps
         "guidance 0": (replace(guided, guidance_scale=0.0), 50),
@@ -208,7 +216,9 @@ def test_names_are_unique_and_no_pipeline_is_loaded_to_list_them() -> None:
 
 
 def test_what_is_not_finite_or_ends_otherwise_has_an_infinite_error() -> None:
-    result, ones, codes = torch.tensor([[1.0, math.nan], [1.0, 1.0]]), torch.ones(2, 2), [SUCCESS] * 2
+    result = torch.tensor([[1.0, math.nan], [1.0, 1.0]])
+    ones = torch.ones(2, 2)
+    codes = [SUCCESS] * 2
     assert error(result, codes, exact=ones) == math.inf
     assert error(ones, codes, DIVERGED) == math.inf
     assert error(ones, codes, exact=2 * ones) == 0.5
@@ -217,8 +227,10 @@ def test_what_is_not_finite_or_ends_otherwise_has_an_infinite_error() -> None:
 @pytest.mark.parametrize("scale", [1.0, 7.5])
 def test_a_difference_grows_as_that_of_two_exact_flows(scale: float) -> None:
     problem = replace(PROBLEMS["gaussian-guided"], guidance_scale=scale)
-    noise, sigma = problem.noise(2), problem.schedule.sigma_max
-    ends, starts = problem.solution(noise).flatten(1), noise.flatten(1) * math.hypot(1.0, sigma)
+    noise = problem.noise(2)
+    sigma = problem.schedule.sigma_max
+    ends = problem.solution(noise).flatten(1)
+    starts = noise.flatten(1) * math.hypot(1.0, sigma)
     expected = carried(problem, sigma) * (starts[1] - starts[0])
     torch.testing.assert_close(ends[1] - ends[0], expected, rtol=1e-6, atol=1e-8)
 

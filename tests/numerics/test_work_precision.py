@@ -18,7 +18,8 @@ from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION, relative_
 from unitouch_gen.numerics.work_precision import measure, pareto_front, pipeline_target, problem_target
 
 PROBLEM = PROBLEMS["gaussian"]
-GAUSSIAN, NOISE = problem_target(PROBLEM, 3), PROBLEM.noise(3)
+GAUSSIAN = problem_target(PROBLEM, 3)
+NOISE = PROBLEM.noise(3)
 MODALITIES = {"touch-to-image": ("touch",), "stylize": ("image", "touch"), "x-to-touch": ("image",)}
 
 
@@ -32,8 +33,10 @@ for each in PIPES.values():
 @pytest.mark.parametrize("solver", ["ddim", "heun", "unipc", "diffusers:ddim", "diffusers:dpm++2m"])
 def test_a_row_has_the_error_against_the_closed_form(solver):
     row = measure(GAUSSIAN, solver, 12, repeats=1)
-    assert row["error_low"] <= row["error"] <= row["error_high"] < 0.3 and row["failures"] == 0
-    assert row["evaluations"] == (23 if solver == "heun" else 12) and row["seconds"] > 0
+    assert row["error_low"] <= row["error"] <= row["error_high"] < 0.3
+    assert row["failures"] == 0
+    assert row["evaluations"] == (23 if solver == "heun" else 12)
+    assert row["seconds"] > 0
     if solver == "ddim":
         latents, _ = PROBLEM.run(NOISE, "ddim", num_inference_steps=12)
         assert row["error"] == pytest.approx(relative_rms(latents, GAUSSIAN.truth).median().item(), rel=1e-5)
@@ -41,30 +44,38 @@ def test_a_row_has_the_error_against_the_closed_form(solver):
 
 def test_what_cannot_be_run_or_breaks_is_a_row_as_well():
     failed = measure(GAUSSIAN, "diffusers:ddim", 1000)  # leading spacing with an offset has no 1000 steps
-    assert failed["failures"] == 3 and failed["reason"].startswith("InvalidInputError: `num_inference_steps` is 1000")
-    pipe, inputs = PIPES["x-to-touch"], {"condition_embeds": torch.ones(2, 1, 16)}
+    assert failed["failures"] == 3
+    assert failed["reason"].startswith("InvalidInputError: `num_inference_steps` is 1000")
+    pipe = PIPES["x-to-touch"]
+    inputs = {"condition_embeds": torch.ones(2, 1, 16)}
     target = pipeline_target(pipe, inputs, seeds=1, guidance_scale=1.0)
     hook = pipe.unet.register_forward_hook(lambda _, args, out: (out[0].index_fill(0, torch.tensor(1), torch.nan),))
     row = measure(target, "euler", 5, repeats=1)
     hook.remove()
-    assert (row["failures"], row["reason"]) == (1, "non_finite") and row["error"] > 0.0
+    assert (row["failures"], row["reason"]) == (1, "non_finite")
+    assert row["error"] > 0.0
 
 
 @pytest.mark.parametrize(("name", "scale"), [("touch-to-image", 2.0), ("stylize", 2.0), ("x-to-touch", 1.0)])
 def test_solvers_come_to_the_reference_of_a_pipeline(name, scale):
-    pipe, inputs = PIPES[name], work_precision.world_inputs(MODALITIES[name], 1)
+    pipe = PIPES[name]
+    inputs = work_precision.world_inputs(MODALITIES[name], 1)
     target = pipeline_target(pipe, inputs, seeds=2, guidance_scale=scale)
     coarse, fine = (measure(target, "heun", steps, repeats=1) for steps in (4, 20))
-    assert fine["error"] < 0.1 and fine["error"] < coarse["error"] and len(target.truth) == 2
+    assert fine["error"] < 0.1
+    assert fine["error"] < coarse["error"]
+    assert len(target.truth) == 2
     assert measure(target, "diffusers:dpm++2m", 20, repeats=1)["error"] < coarse["error"]
     assert type(pipe.scheduler) is DDIMScheduler  # as before
-    assert not fine["default"] and measure(target, "default", target.default_steps, repeats=1)["default"]
+    assert not fine["default"]
+    assert measure(target, "default", target.default_steps, repeats=1)["default"]
 
 
 def test_a_baseline_is_diffusers_own_scheduler():
     scheduler = DDIMScheduler(**STABLE_DIFFUSION, clip_sample=False, set_alpha_to_one=False, steps_offset=1)
     scheduler.set_timesteps(7)
-    z, network = NOISE.float(), PROBLEM.network(3)
+    z = NOISE.float()
+    network = PROBLEM.network(3)
     for timestep in scheduler.timesteps:
         z = scheduler.step(network(z, timestep), timestep, z, return_dict=False)[0]
     row = measure(GAUSSIAN, "diffusers:ddim", 7, repeats=1)
@@ -75,7 +86,9 @@ def test_a_baseline_is_diffusers_own_scheduler():
 
 
 def test_a_distilled_pipeline_runs_at_its_timesteps_without_guidance():
-    pipe, inputs, timesteps = PIPES["x-to-touch"], {"condition_embeds": torch.ones(1, 1, 16)}, [999, 619, 299, 79]
+    pipe = PIPES["x-to-touch"]
+    inputs = {"condition_embeds": torch.ones(1, 1, 16)}
+    timesteps = [999, 619, 299, 79]
     turbo = copy.copy(pipe)
     turbo.scheduler = LCMScheduler()
     turbo.register_to_config(default_num_inference_steps=4, default_timesteps=timesteps)
@@ -98,7 +111,8 @@ def row(steps: int = 10, error: float = 0.01, solver: str = "heun", **values) ->
 def test_the_front_is_what_no_other_beats(points):
     rows = [row(steps, error) for steps, error in points]
     front = pareto_front(rows, "evaluations")
-    assert front and pareto_front([*rows, row(1, 1e-9, "turbo", noisy=True)], "evaluations") == front
+    assert front
+    assert pareto_front([*rows, row(1, 1e-9, "turbo", noisy=True)], "evaluations") == front
     for one in rows:
         beaten = [each for each in rows if each["evaluations"] <= one["evaluations"] and each["error"] < one["error"]]
         assert one not in front or not beaten

@@ -91,7 +91,8 @@ def test_diffusers_makes_our_picture_of_an_image_of_our_parts(components, vae):
     options |= {"noise_level": 20, "output_type": "pt"}
     expected = theirs(photo, generator=seeded(5), **options).images
     back = quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
-    assert back.processor.image_size == 32 and back.unet is ours.unet
+    assert back.processor.image_size == 32
+    assert back.unet is ours.unet
     for pipe in (ours, back):
         assert_close(pipe(touch_embeds=embeds, generator=seeded(5), **options).images, expected, atol=1e-5, rtol=0)
 
@@ -129,7 +130,9 @@ def test_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
     pipe.load_lora_weights(lora[0], adapter_name="bricks")
     whole = draw(pipe)  # on networks that both share
     half = draw(diffusers_pipeline(components), **HALF)
-    assert close(whole, lora[1]) and close(draw(pipe, **HALF), half) and close(draw(pipe, **NONE), plain)
+    assert close(whole, lora[1])
+    assert close(draw(pipe, **HALF), half)
+    assert close(draw(pipe, **NONE), plain)
     assert not any(close(one, other) for one, other in ((whole, plain), (half, plain), (half, whole)))
     with torch.no_grad():
         states, _ = diffusers_pipeline(components).encode_prompt(["brick"], "cpu", 1, False, lora_scale=0.5)
@@ -147,7 +150,8 @@ def test_weights_of_each_pipeline_are_scaled_saved_and_loaded(call, tmp_path):
     layers = adapter(call.pipe.unet, "to_v", "to_out.0")
     half = call.latents(**HALF)
     whole = call.latents()
-    assert close(call.latents(**NONE), plain) and not close(half, plain)
+    assert close(call.latents(**NONE), plain)
+    assert not close(half, plain)
     call.pipe.set_adapters("made", 0.5)
     assert close(call.latents(), half)
     call.pipe.save_lora_weights(tmp_path, unet_lora_layers=layers)

@@ -21,7 +21,8 @@ def call(request):
 
 def test_a_call_without_options_has_the_checkpoints_defaults_and_128_pixels(call):
     output = call()
-    assert output.images.shape == (1, 3, 128, 128) and output.report.success
+    assert output.images.shape == (1, 3, 128, 128)
+    assert output.report.success
     assert call.pipe.guidance_scale == call.pipe.config.default_guidance_scale
     assert output.report.steps == call.pipe.config.default_num_inference_steps
     assert not hasattr(call.pipe.unitouch, "audio_model")
@@ -31,7 +32,8 @@ def test_a_call_without_options_has_the_checkpoints_defaults_and_128_pixels(call
 def test_pictures_and_restyled_photos_share_networks_but_neither_bank_nor_noise_level() -> None:
     pictures, restyled = (unitouch_gen.tiny(name) for name in ("touch-to-image", "stylization"))
     assert pictures.text_encoder is pictures.unitouch.text_model.text_model
-    assert pictures.embedding_bank is None and restyled.embedding_bank is not None
+    assert pictures.embedding_bank is None
+    assert restyled.embedding_bank is not None
     assert pictures.config.default_noise_level < restyled.config.default_noise_level
     weights = zip(pictures.unet.parameters(), restyled.unet.parameters(), strict=True)
     assert all(torch.equal(*pair) for pair in weights)
@@ -41,7 +43,8 @@ def test_a_tolerance_is_kept(call):
     found = call(tolerance=0.1, output_type="latent")
     reference = call.latents(solver="dpm++2m", num_inference_steps=30)
     assert (found.images - reference).norm() / reference.norm() < 0.12
-    assert found.report.evaluations < 40 and found.report.solver == "adaptive"
+    assert found.report.evaluations < 40
+    assert found.report.solver == "adaptive"
 
 
 def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_path):
@@ -49,7 +52,9 @@ def test_a_saved_family_makes_the_same_picture_and_brings_its_card(call, tmp_pat
     loaded = Call(quiet(type(call.pipe).from_pretrained(tmp_path)), call.inputs)
     assert_close(loaded.latents(num_inference_steps=2), call.latents(num_inference_steps=2), atol=1e-4, rtol=1e-4)
     card = (tmp_path / "README.md").read_text()
-    assert "license: apache-2.0" in card and "class mean" in card and list((tmp_path / "pictures").iterdir())
+    assert "license: apache-2.0" in card
+    assert "class mean" in card
+    assert list((tmp_path / "pictures").iterdir())
 
 
 def test_a_family_of_ones_own_is_read_in_the_dtype_asked_for(tmp_path):
@@ -62,7 +67,8 @@ def test_answers_name_what_was_touched_or_seen():
     pipe = unitouch_gen.tiny("touch-to-text")
     names = ["brick", "leather", "wood"]
     touches = pipe([unitouch_gen.example(name) for name in names], "What is it?")
-    assert touches.texts == [f"it is {name}." for name in names] and len(touches.report.tokens) == 3
+    assert touches.texts == [f"it is {name}." for name in names]
+    assert len(touches.report.tokens) == 3
     assert pipe(image=unitouch_gen.example("wood", "image"), question="What is it?").texts == ["it is wood."]
 
 

@@ -46,7 +46,8 @@ def test_it_gets_what_was_asked_for_after_every_step(call):
 def test_other_latents_take_the_place_of_the_state(call):
     zeros = lambda pipe, step, timestep, tensors: {"latents": torch.zeros_like(tensors["latents"]).bfloat16()}  # noqa: E731
     found = call.latents(callback_on_step_end=zeros)
-    assert found.dtype == torch.float32 and not found.any()
+    assert found.dtype == torch.float32
+    assert not found.any()
     in_place = lambda pipe, step, timestep, tensors: {"latents": tensors["latents"].zero_()}  # noqa: E731
     assert not call.latents(callback_on_step_end=in_place).any()
 
@@ -105,7 +106,8 @@ def test_hidden_states_that_it_returns_count_from_then_on(call):
     other = torch.randn(4, 1 if name == "condition_embeds" else 12, 16, generator=seeded())
     change = {"callback_on_step_end": lambda *_: {name: other}}
     one, two = (call.latents(callback_on_step_end_tensor_inputs=asked, **change, **options) for asked in ([], [name]))
-    assert torch.equal(one, two) and not torch.allclose(one, call.latents(**options), atol=1e-4)
+    assert torch.equal(one, two)
+    assert not torch.allclose(one, call.latents(**options), atol=1e-4)
 
 
 def test_a_new_scale_is_that_of_the_next_step_and_ends_with_its_call(call):

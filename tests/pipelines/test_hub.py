@@ -43,7 +43,8 @@ def test_our_loader_runs_no_code_of_a_folder_and_needs_none(pipe, tmp_path, code
 def test_our_loader_reads_a_repository(family, touch, monkeypatch):
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo_id, **options: str(family))
     pipe = TouchToImagePipeline.from_pretrained(REPOSITORY)
-    assert pipe.name_or_path == REPOSITORY and pipe.encode_touch(touch).shape == (2, 16)
+    assert pipe.name_or_path == REPOSITORY
+    assert pipe.encode_touch(touch).shape == (2, 16)
 
 
 def test_a_card_is_one_that_huggingface_reads(pipe, tmp_path):

@@ -47,7 +47,8 @@ def test_a_loaded_pipeline_makes_the_same_picture(call, tmp_path):
     assert read == {"image", "touch"} & set(call.inputs)
     loaded.save_pretrained(tmp_path / "two")
     one, two = (load_file(tmp_path / name / "unitouch" / "model.safetensors") for name in ("one", "two"))
-    assert equal(one, two) and loaded.config.default_guidance_scale == call.pipe.config.default_guidance_scale
+    assert equal(one, two)
+    assert loaded.config.default_guidance_scale == call.pipe.config.default_guidance_scale
     assert not any(part.training for part in loaded.components.values() if isinstance(part, torch.nn.Module))
     kinds = {file.suffix for file in tmp_path.rglob("*") if file.is_file()}
     assert kinds - {".json", ".txt", ".py", ".md"} == {".safetensors"}
@@ -57,7 +58,9 @@ def test_optional_components_may_be_missing_on_disk_left_there_or_replaced(famil
     TouchToImagePipeline(**(components | dict.fromkeys(OPTIONAL))).save_pretrained(tmp_path)
     assert all(load(tmp_path).components[name] is None for name in OPTIONAL)
     pipe = load(family, processor=None, unitouch=components["unitouch"], default_strength=0.5)
-    assert pipe.unitouch is components["unitouch"] and pipe.processor is None and pipe.config.default_strength == 0.5
+    assert pipe.unitouch is components["unitouch"]
+    assert pipe.processor is None
+    assert pipe.config.default_strength == 0.5
 
 
 @pytest.fixture
@@ -157,7 +160,8 @@ def test_what_is_read_and_called_in_inference_mode_can_be_trained(family, touch)
     assert not any(part.is_inference() for part in pipe.unitouch.state_dict().values())
     pixels = pipe.processor.touch(touch).requires_grad_()
     pipe.unitouch.get_touch_features(pixels).sum().backward()
-    assert pixels.grad.abs().sum() > 0 and pipe.unitouch.touch_model.projection.weight.grad is not None
+    assert pixels.grad.abs().sum() > 0
+    assert pipe.unitouch.touch_model.projection.weight.grad is not None
 
 
 def test_a_default_dtype_draws_the_same_picture(call):
@@ -184,7 +188,8 @@ def test_components_make_another_pipeline(call):
     if isinstance(pipe, TouchToImagePipeline):
         made.append(pipe.from_pipe(pipe))
         other = pipe.from_pipe(pipe, unitouch=None, processor=None, default_guidance_scale=4.0)
-        assert other.unitouch is None and other.config.default_guidance_scale == 4.0
+        assert other.unitouch is None
+        assert other.config.default_guidance_scale == 4.0
         cast = pipe.from_pipe(type(pipe)(**copy.deepcopy(pipe.components)), torch_dtype=torch.bfloat16)
         assert {cast.unet.dtype, cast.vae.dtype, cast.unitouch.dtype} == {torch.bfloat16}
     for one in made:

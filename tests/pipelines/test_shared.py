@@ -36,7 +36,8 @@ def test_every_output_type_is_the_decoded_latents(call):
     np.testing.assert_array_equal(array, tensor.permute(0, 2, 3, 1).numpy())
     np.testing.assert_array_equal(np.stack([np.asarray(one) for one in pictures]), (array * 255).round())
     images, report = call(return_dict=False)
-    assert torch.equal(images, tensor) and report.success
+    assert torch.equal(images, tensor)
+    assert report.success
 
 
 @pytest.mark.parametrize(("size", "shape"), [([8, 4], (16, 8)), (None, None)])
@@ -54,14 +55,16 @@ def test_pictures_are_as_large_as_the_unet_says_or_the_call(call, size, shape):
 def test_a_seed_fixes_the_picture_and_leaves_the_global_one_alone(call):
     before = torch.random.get_rng_state()
     first, again, other = (call.latents(generator=seeded(seed), eta=1.0, solver="ddim") for seed in (1, 1, 2))
-    assert torch.equal(first, again) and (first - other).abs().max() > 1e-3
+    assert torch.equal(first, again)
+    assert (first - other).abs().max() > 1e-3
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_given_latents_are_the_start_and_stay_as_they_were(call):
     noise = noise_for(call)
     first = call.latents(latents=noise)
-    assert torch.equal(noise, noise_for(call)) and torch.equal(first, call.latents(latents=noise))
+    assert torch.equal(noise, noise_for(call))
+    assert torch.equal(first, call.latents(latents=noise))
     assert not torch.allclose(first, call.latents(latents=-noise), atol=1e-3)
     images = call.latents(num_images_per_prompt=2, latents=noise[:1].expand(4, -1, -1, -1))
     assert_close(images[::2], images[1::2], atol=1e-5, rtol=0)  # pictures of one input stand together
@@ -106,8 +109,10 @@ def test_every_solver_makes_finite_pictures_and_leaves_the_scheduler_as_it_was(c
     timesteps = scheduler.timesteps.clone()
     output = call(solver=solver, num_inference_steps=4)
     assert torch.isfinite(output.images).all()
-    assert output.report.solver == (solver or "DDIMScheduler") and output.report.steps == 4
-    assert dict(scheduler.config) == config and torch.equal(scheduler.timesteps, timesteps)
+    assert output.report.solver == (solver or "DDIMScheduler")
+    assert output.report.steps == 4
+    assert dict(scheduler.config) == config
+    assert torch.equal(scheduler.timesteps, timesteps)
     assert scheduler.num_inference_steps is None
 
 
@@ -117,7 +122,8 @@ def test_other_precisions_are_near_float32_on_a_float32_state(call, dtype, near)
     expected = call.latents(latents=noise)
     call.pipe.unet.to(dtype)
     found = call.latents(latents=noise)
-    assert found.dtype == torch.float32 and (found - expected).norm() / expected.norm() < near
+    assert found.dtype == torch.float32
+    assert (found - expected).norm() / expected.norm() < near
     call.pipe.to(dtype)  # the noise on embeddings is that of float32
     assert (call.latents(latents=noise) - expected).norm() / expected.norm() < 2 * near
     assert call().images.dtype == torch.float32
@@ -148,7 +154,8 @@ def test_leaving_out_changes_nothing(call):
         ran = watched(call.pipe)
         options = {"guidance_scale": 1.0, "generator": seeded(), "output_type": "latent"}
         again = call.pipe(**{name: plain.embeds}, **options)
-        assert torch.equal(again.images, plain.images) and "touch encoder" in again.report.left_out
+        assert torch.equal(again.images, plain.images)
+        assert "touch encoder" in again.report.left_out
         assert not {"touch encoder", "image encoder"} & {one for one, _ in ran}
 
 
@@ -156,7 +163,8 @@ def test_the_report_counts_evaluations_and_seconds_and_is_plain_values(call):
     ran = watched(call.pipe)
     report = call(solver="heun", num_inference_steps=np.int64(3), guidance_scale=np.float32(2.5)).report
     assert report.evaluations == [name for name, _ in ran].count("UNet") == 2 * 3 - 1
-    assert all(seconds > 0 for seconds in report.seconds.values()) and {"denoising", "decoding"} < set(report.seconds)
+    assert all(seconds > 0 for seconds in report.seconds.values())
+    assert {"denoising", "decoding"} < set(report.seconds)
     assert json.loads(json.dumps(report.to_dict()))["steps"] == 3
 
 
@@ -173,7 +181,8 @@ def test_if_all_break_nothing_comes_back_in_the_kind_asked_for_and_the_next_call
     for kind in ("pil", "pt", "np", "latent"):
         options = {"throw": False, "output_type": kind}
         images, whole = (call(callback_on_step_end=put(value), **options).images for value in (NAN, 0.0))
-        assert type(images) is type(whole) and len(images) == 0
+        assert type(images) is type(whole)
+        assert len(images) == 0
         assert kind == "pil" or images.shape[1:] == whole.shape[1:]
 
 
@@ -183,7 +192,8 @@ def test_a_picture_that_breaks_in_decoding(call):
     with pytest.raises(NonFiniteError, match="Sample 0 is not finite after decoding"):
         call()
     output = call(throw=False)
-    assert len(output.images) == 1 and output.report.failed_at == {0: 2}
+    assert len(output.images) == 1
+    assert output.report.failed_at == {0: 2}
     assert output.report.codes == [ReturnCode.NON_FINITE, ReturnCode.SUCCESS]
 
 
@@ -201,7 +211,8 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
     for network in (joint.touch_model.projection, joint.vision_model.visual_projection):
         network.register_forward_hook(lambda *args: args[-1] * huge)
     output = call(throw=False)
-    assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1
+    assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE]
+    assert len(output.images) == 1
 
 
 def test_little_work_takes_one_thread_and_gives_the_others_back(pipe, touch):

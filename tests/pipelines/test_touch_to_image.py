@@ -35,7 +35,8 @@ def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch):
     plain = pipe.encode_touch(touch, bridge=False)
     output = pipe(touch)
     assert_close(output.embeds, bank.bridge(plain))
-    assert torch.equal(pipe.encode_touch(touch), output.embeds) and not torch.allclose(output.embeds, plain)
+    assert torch.equal(pipe.encode_touch(touch), output.embeds)
+    assert not torch.allclose(output.embeds, plain)
     assert torch.equal(pipe(touch, bridge=False).embeds, plain)
     assert torch.equal(pipe(touch_embeds=plain).embeds, plain)
 
@@ -74,7 +75,8 @@ def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch
     for call in (pipe, getattr(pipe, encode)):
         with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[0\]`: unlike anything known\. .* a guess") as caught:
             made = call(touch=touch)
-        assert len(caught) == 1 and caught[0].filename == __file__
+        assert len(caught) == 1
+        assert caught[0].filename == __file__
         assert call is not pipe or (made.report.unknown == {"touch": reasons} and made.report.success)
     reasons[0] = None
     with warnings.catch_warnings():
@@ -85,7 +87,8 @@ def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch
 def test_the_noise_level_is_the_checkpoints_unless_a_call_says_another(draw, pipe):
     clean = draw(noise_level=0)
     noisy = draw(noise_level=999)
-    assert torch.equal(draw(), clean) and (clean - noisy).abs().max() > 1e-3
+    assert torch.equal(draw(), clean)
+    assert (clean - noisy).abs().max() > 1e-3
     pipe.register_to_config(default_noise_level=999)
     assert torch.equal(draw(), noisy)
 
@@ -122,4 +125,5 @@ def test_embeddings_alone_need_no_encoders(components, pipe, draw):
     embeds = torch.ones(1, 16)
     for options in ({"negative_prompt_embeds": 0 * states}, {"guidance_scale": 1.0, "negative_prompt": "metal"}):
         output = pipe(touch_embeds=embeds, prompt_embeds=states, output_type="pt", **options)
-        assert torch.isfinite(output.images).all() and "prompt encoder" in output.report.left_out
+        assert torch.isfinite(output.images).all()
+        assert "prompt encoder" in output.report.left_out

@@ -35,14 +35,17 @@ def test_answers_are_those_of_the_language_model_with_the_touch_attached(ask, to
             made = ask.language_model.generate(ids, attention_mask=torch.ones_like(ids), **SHORT)[0, ids.shape[1] :]
         assert output.texts[row] == ask.tokenizer.decode(made, skip_special_tokens=True).strip()
         assert output.report.prompt_tokens[row] == ids.shape[1]
-    assert output.report.tokens == [6, 6] and set(output.report.seconds) == {"touch", "answer"}
+    assert output.report.tokens == [6, 6]
+    assert set(output.report.seconds) == {"touch", "answer"}
     texts, report = ask(touch_embeds=embeds, question=questions, return_dict=False, **SHORT)
-    assert texts == output.texts and "12 tokens" in str(report)
+    assert texts == output.texts
+    assert "12 tokens" in str(report)
 
 
 def test_one_input_has_several_questions_or_answers(ask, photo):
     several = ask(touch_embeds=EMBEDS[:1], question=[QUESTION, "Where?"], num_beams=2, num_return_sequences=2, **SHORT)
-    assert len(several.texts) == 4 and several.embeds.shape == (1, D)
+    assert len(several.texts) == 4
+    assert several.embeds.shape == (1, D)
     assert (
         several.texts[:2]
         == ask(touch_embeds=EMBEDS[:1], question=QUESTION, num_beams=2, num_return_sequences=2, **SHORT).texts
@@ -58,7 +61,8 @@ def test_a_seed_fixes_the_answer_whatever_threads_do_and_leaves_the_global_one_a
 
     before = torch.random.get_rng_state()
     expected = [call(seed) for seed in range(6)]
-    assert len({*map(tuple, expected)}) > 1 and torch.equal(torch.random.get_rng_state(), before)
+    assert len({*map(tuple, expected)}) > 1
+    assert torch.equal(torch.random.get_rng_state(), before)
     with ThreadPoolExecutor(3) as pool:
         assert list(pool.map(call, range(6))) == expected
 
@@ -76,7 +80,8 @@ def test_prompts_are_put_as_the_language_model_was_trained_and_streamed(ask):
             printed = "".join(streamer)
             output = answer.result()
         wanted = "[Where?]" if chat else "<s>" + template.replace("{question}", "Where?")
-        assert printed.startswith(wanted) and printed.strip().endswith(output.texts[0])
+        assert printed.startswith(wanted)
+        assert printed.strip().endswith(output.texts[0])
         sizes += output.report.prompt_tokens
     assert len({*sizes}) > 1
 

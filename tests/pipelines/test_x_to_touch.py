@@ -124,7 +124,8 @@ def seen_by_network(pipe: XToTouchPipeline, **inputs) -> tuple[torch.Tensor, lis
 def test_a_sensor_is_known_by_its_name_or_by_its_background(x_to_touch, tmp_path):
     pipe = shown_gels(x_to_touch)
     beside, labels = seen_by_network(pipe, sensor=["digit", "gelsight"])
-    assert labels == [1, 0] and torch.equal(beside, pipe.backgrounds.latents.flip(0))
+    assert labels == [1, 0]
+    assert torch.equal(beside, pipe.backgrounds.latents.flip(0))
     gel = torch.rand(3, 16, 16, generator=seeded(3))
     beside, labels = seen_by_network(pipe, background=gel)
     assert labels == [2]

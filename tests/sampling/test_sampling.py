@@ -153,10 +153,12 @@ def test_it_is_a_line_of_solver_counts_time_and_outcome_and_goes_through_json_as
         unknown={"touch": ["unlike anything known", None]},
     )
     values = json.loads(json.dumps(report.to_dict()))
-    assert values["codes"] == ["success", "non_finite"] and values["failed_at"] == {"1": 3}
+    assert values["codes"] == ["success", "non_finite"]
+    assert values["failed_at"] == {"1": 3}
     assert values["seconds"] == report.seconds
     report.to_dict()["left_out"].append("x")
-    assert report.left_out == ["VAE"] and "\n" not in str(report)
+    assert report.left_out == ["VAE"]
+    assert "\n" not in str(report)
     for part in ("unipc: 10 steps, 10 evaluations, 1.75 s (touch", "success, non_finite; 1 of the inputs unknown"):
         assert part in str(report)
     assert str(RunReport(codes=[SUCCESS])).endswith("0 evaluations, 0.00 s (); all finite")

@@ -127,7 +127,8 @@ def test_the_result_is_within_tolerance_for_more_evaluations_the_tighter(name):
         assert report.codes == [ReturnCode.SUCCESS] * 8
         assert report.evaluations >= report.steps
         evaluations.append(report.evaluations)
-    assert evaluations == sorted(evaluations) and evaluations[-1] < 80
+    assert evaluations == sorted(evaluations)
+    assert evaluations[-1] < 80
 
 
 def test_the_last_step_ends_at_the_last_level_itself():
@@ -136,7 +137,8 @@ def test_the_last_step_ends_at_the_last_level_itself():
         asked = []
         noted = lambda z, timestep: asked.append(float(timestep)) or network(z, timestep)  # noqa: E731, B023
         problem.run(problem.noise(2), tolerance=tolerance, network=noted)
-        assert asked[-1] == 0.0 and all(one != other for one, other in itertools.pairwise(asked))
+        assert asked[-1] == 0.0
+        assert all(one != other for one, other in itertools.pairwise(asked))
 
 
 def test_a_network_that_turns_sharply_gets_steps_refused():
@@ -152,7 +154,8 @@ def test_too_few_evaluations_raise_or_return_the_last_prediction():
     with pytest.raises(NotConvergedError, match=r"Stopped after 7 evaluations.*max_evaluations"):
         GAUSSIAN.run(noise, tolerance=0.01, max_evaluations=7)
     latents, report = GAUSSIAN.run(noise, tolerance=0.01, max_evaluations=7, throw=False)
-    assert report.codes == [ReturnCode.MAX_EVALUATIONS] * 2 and report.evaluations == 7
+    assert report.codes == [ReturnCode.MAX_EVALUATIONS] * 2
+    assert report.evaluations == 7
     assert latents.abs().max() < 2 * GAUSSIAN.solution(noise).abs().max()  # rather than the noise of the state
 
 

@@ -29,13 +29,15 @@ def test_a_batch_is_a_copy_of_its_rows_of_every_column() -> None:
     for _ in range(2):
         batch = dataset[indices]
         np.testing.assert_array_equal(batch["stacked"], np.concatenate(parts)[indices])
-        assert batch["array"].tolist() == indices and torch.equal(batch["tensor"], torch.tensor(indices) / 10)
+        assert batch["array"].tolist() == indices
+        assert torch.equal(batch["tensor"], torch.tensor(indices) / 10)
         for values in batch.values():
             values.zero_()
     assert len(dataset) == len(ArrayDataset(array=np.arange(11))) == 11
 
 
-SIZES, SIGMA = np.array([300, 100, 200]), SamplerSettings(sigma=0.75)
+SIZES = np.array([300, 100, 200])
+SIGMA = SamplerSettings(sigma=0.75)
 
 
 def sources(batch: list[int], sizes: np.ndarray = SIZES) -> np.ndarray:
@@ -45,7 +47,8 @@ def sources(batch: list[int], sizes: np.ndarray = SIZES) -> np.ndarray:
 
 def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() -> None:
     counts = np.stack([sources(in_batch_indices(step, SIZES, 20, SIGMA, seed=3)) for step in range(1500)])
-    assert (counts.max(axis=1) == 15).all() and (counts.sum(axis=1) == 20).all()  # the rest is never of the chosen one
+    assert (counts.max(axis=1) == 15).all()  # the rest is never of the chosen one
+    assert (counts.sum(axis=1) == 20).all()
     chosen = np.eye(3, dtype=bool)[counts.argmax(axis=1)]
     assert chisquare(chosen.sum(axis=0), len(counts) * SIZES / SIZES.sum()).pvalue > 0.01
     others = np.where(chosen, 0, SIZES)
@@ -72,18 +75,26 @@ def test_a_batch_of_one_part_is_whole(in_first: np.ndarray) -> None:
 def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> None:
     batches = [[shuffled_indices(10 * epoch + place, 103, 10) for place in range(10)] for epoch in range(5)]
     epochs = [[*itertools.chain(*epoch)] for epoch in batches]
-    assert all(len({*epoch}) == len(epoch) == 100 for epoch in epochs) and epochs[0] != epochs[1]
+    assert all(len({*epoch}) == len(epoch) == 100 for epoch in epochs)
+    assert epochs[0] != epochs[1]
     assert {index for epoch in epochs for index in epoch} == {*range(103)}
 
 
-@pytest.mark.parametrize("indices_of", [partial(in_batch_indices, sizes=SIZES, batch_size=16, settings=SIGMA),
-                                        partial(shuffled_indices, size=50, batch_size=8)])  # fmt: skip
+@pytest.mark.parametrize(
+    "indices_of",
+    [
+        partial(in_batch_indices, sizes=SIZES, batch_size=16, settings=SIGMA),
+        partial(shuffled_indices, size=50, batch_size=8),
+    ],
+)
 def test_a_batch_follows_from_the_number_of_its_step_and_the_seed(indices_of: Callable) -> None:
     assert indices_of(9, seed=7) == indices_of(9, seed=7)
-    assert indices_of(0, seed=7) != indices_of(1, seed=7) and indices_of(0, seed=7) != indices_of(0, seed=8)
+    assert indices_of(0, seed=7) != indices_of(1, seed=7)
+    assert indices_of(0, seed=7) != indices_of(0, seed=8)
 
 
-TIME, PERMUTED = torch.arange(12), [*itertools.permutations(range(3))]
+TIME = torch.arange(12)
+PERMUTED = [*itertools.permutations(range(3))]
 
 
 def moved(image: Tensor) -> list[Tensor]:
@@ -110,25 +121,31 @@ def blurred(image: Tensor) -> list[Tensor]:
 )
 def test_each_image_becomes_one_of_those_that_it_can_become(augment: Callable, candidates: Callable) -> None:
     torch.manual_seed(0)
-    images, found = torch.rand(256, 3, 12, 12), set()
+    images = torch.rand(256, 3, 12, 12)
+    found = set()
     before = images.clone()
     for image, out in zip(before, augment(images), strict=True):
         (which,) = [number for number, one in enumerate(candidates(image)) if torch.allclose(one, out, atol=1e-6)]
         found.add(which)
-    assert found == {*range(len(candidates(images[0])))} and torch.equal(images, before)
+    assert found == {*range(len(candidates(images[0])))}
+    assert torch.equal(images, before)
 
 
 def test_jitter_is_one_line_for_each_channel_and_noise_has_a_level_for_each_image() -> None:
     torch.manual_seed(0)
     images = 0.3 + 0.3 * torch.rand(32, 3, 8, 8)  # in the middle, where nothing is clamped
-    x, y = images.flatten(2), batches.jitter_colours(images, gain=0.1, offset=0.05).flatten(2)
+    x = images.flatten(2)
+    y = batches.jitter_colours(images, gain=0.1, offset=0.05).flatten(2)
     gain = ((x - x.mean(2, True)) * (y - y.mean(2, True))).sum(2) / (x - x.mean(2, True)).square().sum(2)
     offset = y.mean(2) - gain * x.mean(2)
     torch.testing.assert_close(gain[..., None] * x + offset[..., None], y)
-    assert 0.05 < (gain - 1).abs().max() <= 0.1 + 1e-5 and offset.abs().max() <= 0.05 + 1e-5
+    assert 0.05 < (gain - 1).abs().max() <= 0.1 + 1e-5
+    assert offset.abs().max() <= 0.05 + 1e-5
     noise = batches.add_noise(torch.full((64, 3, 32, 32), 0.5), 0.05) - 0.5
     deviation = noise.flatten(1).std(dim=1)
-    assert noise.mean().abs() < 1e-3 and deviation.max() < 0.05 * 1.06 and deviation.std() > 0.005
+    assert noise.mean().abs() < 1e-3
+    assert deviation.max() < 0.05 * 1.06
+    assert deviation.std() > 0.005
     for bright in (batches.jitter_colours(images + 0.6, 0.3, 0.2), batches.add_noise(images + 0.6, 0.2)):
         assert bright.max() == 1.0
 

@@ -75,7 +75,8 @@ def test_what_is_drawn_is_moved_from_what_the_critic_knows_to_what_the_teacher_d
 def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None:
     unet = make_components()["unet"]
     add_layers(unet, LORA, 3)
-    objective, lcm = make(unet, kind), LCMScheduler(**{**SCHEDULE, "prediction_type": kind})
+    objective = make(unet, kind)
+    lcm = LCMScheduler(**{**SCHEDULE, "prediction_type": kind})
     noise = torch.randn(2, 4, 8, 8)
     conditions = {"encoder_hidden_states": torch.randn(2, 3, 16), "class_labels": torch.randn(2, 32)}
     seen = set()
@@ -83,7 +84,8 @@ def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None
         torch.manual_seed(seed)
         found = objective.drawn(noise, conditions)
         torch.manual_seed(seed)
-        last, z = int(torch.randint(4, ())), noise
+        last = int(torch.randint(4, ()))
+        z = noise
         lcm.set_timesteps(timesteps=objective.timesteps)
         with torch.no_grad():
             for t in lcm.timesteps[: last + 1]:
@@ -97,7 +99,8 @@ def test_the_student_draws_as_the_scheduler_of_diffusers_does(kind: str) -> None
 def test_layers_alone_are_trained_each_set_by_its_own_loss() -> None:
     unet = make_components()["unet"]
     add_layers(unet, LORA, 3)
-    objective, latents = make(unet), torch.randn(8, 4, 8, 8)
+    objective = make(unet)
+    latents = torch.randn(8, 4, 8, 8)
     conditions = {"encoder_hidden_states": torch.randn(8, 3, 16), "class_labels": torch.randn(8, 32)}
     nothing = {name: torch.zeros_like(values) for name, values in conditions.items()}
     objective.frozen[0].conditions = lambda batch, kept: conditions if kept.all() else nothing
@@ -124,10 +127,16 @@ def test_layers_alone_are_trained_each_set_by_its_own_loss() -> None:
 
 PIPELINES = {"touch-to-image": "touch", "x-to-touch": "image"}
 RECIPE = (
-    "data.drawn={sensors: [digit], objects: 1, contacts_per_object: 1}", "trainer.steps=2", "trainer.batch_size=8",
-    "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2", "trainer.learning_rate=0.1",
-    "lora.r=2", "objective.critic_rank=2",
-)  # fmt: skip
+    "data.drawn={sensors: [digit], objects: 1, contacts_per_object: 1}",
+    "trainer.steps=2",
+    "trainer.batch_size=8",
+    "trainer.warmup=1",
+    "trainer.save_every=1",
+    "trainer.keep_checkpoints=2",
+    "trainer.learning_rate=0.1",
+    "lora.r=2",
+    "objective.critic_rank=2",
+)
 
 
 def words_of(teacher: Path, output: Path, cache: Path, *words: str) -> list[str]:

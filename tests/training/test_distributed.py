@@ -28,7 +28,8 @@ class Matching(nn.Module):
     def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         self.noise = torch.randn(len(batch["x"]))
         found = self.trained(batch["x"])
-        contrast, error = symmetric_info_nce(found, batch["y"], 0.1), (found - batch["y"]).square().mean()
+        contrast = symmetric_info_nce(found, batch["y"], 0.1)
+        error = (found - batch["y"]).square().mean()
         return {"loss": contrast + error, "contrast": contrast}
 
 

@@ -33,12 +33,14 @@ def test_info_nce_is_equation_1_and_has_its_closed_forms(tau: float) -> None:
     forth, back = (equation_1(a.numpy(), b.numpy(), tau) for a, b in ((TOUCH, IMAGE), (IMAGE, TOUCH)))
     assert info_nce(TOUCH, 40 * IMAGE, tau).item() == pytest.approx(forth, rel=1e-5)
     assert symmetric_info_nce(TOUCH, IMAGE, tau).item() == pytest.approx(forth + back, rel=1e-5)
-    basis, aligned = torch.eye(6), math.log1p(5 * math.exp(-1.0 / tau))
+    basis = torch.eye(6)
+    aligned = math.log1p(5 * math.exp(-1.0 / tau))
     assert info_nce(basis, basis, tau).item() == pytest.approx(aligned, abs=1e-6)
     assert info_nce(basis, basis.roll(1, dims=0), tau).item() == pytest.approx(1.0 / tau + aligned, rel=1e-4)
     assert info_nce(basis, torch.ones(6, 6), tau).item() == pytest.approx(math.log(6), abs=1e-5)
     half, single = (info_nce(TOUCH.bfloat16().to(kind), IMAGE, tau) for kind in (torch.bfloat16, torch.float32))
-    assert half.dtype == torch.float32 and torch.equal(half, single)
+    assert half.dtype == torch.float32
+    assert torch.equal(half, single)
 
 
 class Predicts(nn.Module):
@@ -56,7 +58,8 @@ class Predicts(nn.Module):
 def run(kind: str, power: float, gain: float = 0.0, beside: Tensor | None = None) -> tuple[float, Tensor, Predicts]:
     """The loss of 600 latents, the cumulative alphas of their steps, and the network."""
     torch.manual_seed(0)
-    scheduler, network = DDPMScheduler(prediction_type=kind, clip_sample=False), Predicts(gain)
+    scheduler = DDPMScheduler(prediction_type=kind, clip_sample=False)
+    network = Predicts(gain)
     loss = denoising_loss(network, scheduler, torch.randn(600, 4, 4, 4), power, beside)  # type: ignore[arg-type]
     return loss.item(), scheduler.alphas_cumprod[network.steps], network
 

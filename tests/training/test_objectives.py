@@ -46,7 +46,8 @@ def vq() -> VQModel:
 
 
 def make_unclip(model: UniTouchModel, processor: UniTouchProcessor, **changes: float) -> nn.Module:
-    normalizer, noising = unclip.fit_normalizer(EMBEDS), DDPMScheduler(beta_schedule="squaredcos_cap_v2")
+    normalizer = unclip.fit_normalizer(EMBEDS)
+    noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     texts = (["slick glass"] * COUNT, processor, model.text_model.text_model)
     return unclip.UnclipObjective(Shown(), SCHEDULER, UNCLIP.model_copy(update=changes), normalizer, noising, *texts)  # type: ignore[arg-type]
 
@@ -57,16 +58,19 @@ def make_touch_ldm(backgrounds: Tensor | None = None, **changes: float) -> nn.Mo
 
 
 def test_touches_are_pulled_to_their_pictures_and_tokens_learn_from_their_own_sensor(model: UniTouchModel) -> None:
-    objective, pixels = TouchObjective(model, STILL, LossWeights(cosine=3.0)).eval(), torch.randn(2, 3, 32, 32)
+    objective = TouchObjective(model, STILL, LossWeights(cosine=3.0)).eval()
+    pixels = torch.randn(2, 3, 32, 32)
     objective.augmented = lambda touch: touch  # type: ignore[method-assign]
-    embeds, sensors = torch.randn(2, WIDTH), torch.tensor([1, -1])
+    embeds = torch.randn(2, WIDTH)
+    sensors = torch.tensor([1, -1])
     losses = objective({"touch": pixels, "sensor": sensors, "image_embeds": embeds})
     cosine = F.cosine_similarity(model.get_touch_features(pixels, sensors), embeds).mean()
     assert losses["cosine"].item() == pytest.approx(1.0 - cosine.item(), abs=1e-5)
     assert losses["loss"].item() == pytest.approx((losses["image"] + 3.0 * losses["cosine"]).item(), rel=1e-5)
     losses["loss"].backward()
     gradient = model.sensor_bank.tokens.grad
-    assert gradient[1].abs().max() > 0 and gradient[0].abs().max() == 0
+    assert gradient[1].abs().max() > 0
+    assert gradient[0].abs().max() == 0
 
 
 def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Contacts) -> None:
@@ -89,8 +93,10 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
     touch.start_from(fresh, tmp_path / "whole")
     for name, tensor in model.touch_model.state_dict().items():
         assert torch.equal(fresh.touch_model.state_dict()[name], tensor)
-    kept, known = fresh.sensor_bank.tokens, model.sensor_bank
-    assert torch.equal(kept[0], known.tokens[known.index("digit")]) and torch.equal(kept[1], before[1])
+    kept = fresh.sensor_bank.tokens
+    known = model.sensor_bank
+    assert torch.equal(kept[0], known.tokens[known.index("digit")])
+    assert torch.equal(kept[1], before[1])
     with pytest.raises(InvalidInputError, match=r"`init` is .*: This model has no touch encoder"):
         touch.start_from(model, Path(joint))
 
@@ -103,7 +109,8 @@ def test_a_distance_that_knows_touches_from_pictures_is_kept_with_the_touch_enco
     again = UniTouchModel.from_pretrained(tmp_path / "touch")
     assert [*again.config.ood_thresholds] == ["touch"]
     reaches = again.config.sensor_reaches
-    assert set(reaches) == {"gelsight", "digit"} and 0.0 < reaches["digit"] < 0.3
+    assert set(reaches) == {"gelsight", "digit"}
+    assert 0.0 < reaches["digit"] < 0.3
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
         reasons = again.encode_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))[1]
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high
@@ -113,7 +120,9 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
     mixing = np.random.default_rng(0).normal(size=(6, 6)) * [1.0, 3.0, 0.1, 1.0, 10.0, 1.0]
     drawn = np.random.default_rng(1).normal(size=(620, 6)) @ mixing
     drawn[300:600] += mixing.sum(axis=0) * 4.0
-    features, labels, others = drawn[:600], np.repeat([0, 1], 300), drawn[600:]
+    features = drawn[:600]
+    labels = np.repeat([0, 1], 300)
+    others = drawn[600:]
     means = [features[labels == label].mean(axis=0) for label in (0, 1)]
     residuals = features - np.stack(means)[labels]
     inverse = np.linalg.inv(residuals.T @ residuals / 600)
@@ -125,13 +134,15 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
 
 
 def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differences() -> None:
-    vae, batch = autoencoder(), {"pixels": torch.from_numpy(PICTURES)}
+    vae = autoencoder()
+    batch = {"pixels": torch.from_numpy(PICTURES)}
     losses = AutoencoderObjective(vae, PLAIN.model_copy(update={"gradient_weight": 0.5, "latent_weight": 0.1}))(batch)
     pixels = to_signed(batch["pixels"])
     with torch.no_grad():
         latents = vae.encode(pixels).latents
         error = vae.decode(latents).sample - pixels
-    across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
+    across = error[..., 1:] - error[..., :-1]
+    down = error[..., 1:, :] - error[..., :-1, :]
     edges = across.abs().mean() + down.abs().mean()
     expected = error.abs().mean() + 0.5 * edges + 0.1 * latents.square().mean()
     assert losses["loss"].item() == pytest.approx(expected.item(), rel=1e-5)
@@ -140,9 +151,9 @@ def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differen
 
 
 def test_the_error_of_features_is_that_of_a_stem_relative_to_what_it_sees() -> None:
-    layer, deviation = nn.Conv2d(3, 4, 3), torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]  # CLIP's
-    shown, wanted = (torch.from_numpy(pictures).float() / 255 for pictures in (PICTURES[::-1].copy(), PICTURES))
-    features = image_vae.StemFeatures([layer])
+    layer = nn.Conv2d(3, 4, 3)
+    deviation = torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]  # CLIP's
+    shown, wanted = (to_signed(torch.from_numpy(pictures)) for pictures in (PICTURES[::-1].copy(), PICTURES))
     with torch.no_grad():
         apart = F.conv2d((shown - wanted) / deviation, layer.weight).abs().mean(dim=(0, 2, 3))
         size = F.conv2d(wanted / deviation, layer.weight).transpose(0, 1).flatten(1).std(dim=1)  # of what varies
@@ -166,7 +177,8 @@ def test_the_error_of_contrast_sees_how_much_a_texture_varies_and_not_where() ->
 
 
 def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
-    vae, pixels = vq(), to_signed(torch.from_numpy(PICTURES))
+    vae = vq()
+    pixels = to_signed(torch.from_numpy(PICTURES))
     loss = AutoencoderObjective(vae, PLAIN)({"pixels": torch.from_numpy(PICTURES)})["loss"].item()
     with torch.no_grad():
         latents = vae.encode(pixels).latents
@@ -178,7 +190,8 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
 
 
 def test_latents_are_scaled_to_unit_variance() -> None:
-    vae, pixels = autoencoder(scaling_factor=0.5), torch.from_numpy(PICTURES)
+    vae = autoencoder(scaling_factor=0.5)
+    pixels = torch.from_numpy(PICTURES)
     with torch.no_grad():
         raw = vae.encode(to_signed(pixels)).latents
     scale = image_vae.latent_scale(vae, ArrayDataset(pixels=PICTURES))
@@ -237,7 +250,9 @@ def test_embeddings_without_a_noise_level_are_those_of_the_picture_times_a_gain(
     clean = torch.from_numpy(nearest(seen.labels[:, WIDTH:], LEVELS) == 0)
     gain = (seen.labels[clean, :WIDTH] * EMBEDS[clean]).sum(1) / EMBEDS[clean].square().sum(1)
     # Level 0 still adds a little noise: sqrt(1 - abar_0) = 0.006 standard deviations.
-    assert gain.min() > 0.68 and gain.max() < 1.02 and gain.mean().item() == pytest.approx(0.85, abs=0.03)
+    assert gain.min() > 0.68
+    assert gain.max() < 1.02
+    assert gain.mean().item() == pytest.approx(0.85, abs=0.03)
 
 
 def test_the_condition_of_a_touch_is_one_token_of_the_joint_spaces_norm_or_zeros() -> None:
@@ -262,12 +277,14 @@ def test_some_conditions_are_perturbed_and_keep_their_norm() -> None:
 
 def test_every_contact_knows_what_both_of_its_sensors_see_untouched(cache: Path, processor: UniTouchProcessor) -> None:
     config = DataConfig(drawn={"sensors": [None, "digit"], "objects": 1, "contacts_per_object": 2})
-    sources, size = config.sources(), processor.image_size
+    sources = config.sources()
+    size = processor.image_size
     splits = columns_of(sources, cache, config, processor, ("image", "touch"))
     gels = torch.cat([source.untouched("train", size).flatten(0, 1) for source in sources])
     for split, source, places in zip(splits, sources, touch_ldm.places_of(splits), strict=True):
         for row, place in enumerate(places):
             for which, sensor in enumerate(source.pair("train", row // 16)):
                 assert row % 16 or torch.equal(gels[place + which], untouched_gel(sensor, size))
-        assert len(places) == len(split) and (places[0] == places[15] == places[16] - 2)
+        assert len(places) == len(split)
+        assert places[0] == places[15] == places[16] - 2
     assert sensor_numbers(splits, ["digit"], unnamed=1).tolist() == [1] * len(splits[0]) + [0] * len(splits[1])

@@ -23,7 +23,8 @@ def autoencoder_of(model: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_recipe_is_read_and_built(name: str) -> None:
     recipe = read_as(name)
-    assert recipe.data.sets == [] and (recipe.data.drawn is None) == name.endswith("_paper")
+    assert recipe.data.sets == []
+    assert (recipe.data.drawn is None) == name.endswith("_paper")
     with torch.device("meta"):
         if name == "image_text":
             config = build("model", UniTouchConfig, recipe.model)
@@ -42,9 +43,11 @@ def test_the_papers_networks_have_its_sizes() -> None:
         vae = autoencoder_of(vae_recipe.model)
         latents = vae.encode(torch.empty(1, 3, 256, 256)).latents
         unet = UNet2DConditionModel(**recipe.model, num_class_embeds=3)
-        token, sensor = torch.empty(1, 1, 1024), torch.zeros(1, dtype=torch.int64)
+        token = torch.empty(1, 1, 1024)
+        sensor = torch.zeros(1, dtype=torch.int64)
         sample = unet(latents, torch.zeros(1), token, class_labels=sensor).sample
-    assert vae_recipe.data.touch_size == 256 and latents.shape == sample.shape == (1, 3, 64, 64)
+    assert vae_recipe.data.touch_size == 256
+    assert latents.shape == sample.shape == (1, 3, 64, 64)
     assert vae.quantize.embedding.weight.shape == (8192, 3)
     assert 8.2e8 < sum(parameter.numel() for parameter in unet.parameters()) < 9.1e8  # Stable Diffusion 1: 0.86e9
     assert (recipe.trainer.weight_decay, recipe.trainer.learning_rate, recipe.trainer.batch_size) == (0.0, 1e-6, 48)

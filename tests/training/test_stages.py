@@ -29,15 +29,23 @@ from unitouch_gen.world import World
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHORT = (
-    "data.drawn={sensors: [null, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=2",
-    "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=1", "trainer.keep_checkpoints=2",
-)  # fmt: skip
+    "data.drawn={sensors: [null, digit], objects: 1, contacts_per_object: 1}",
+    "trainer.steps=2",
+    "trainer.batch_size=8",
+    "trainer.warmup=1",
+    "trainer.save_every=1",
+    "trainer.keep_checkpoints=2",
+)
 ALONE = ("data.image_size=32", f"data.audio={json.dumps(AUDIO)}")
 """What the other stages take from the joint space."""
 
 VAE = tuple(f"model.{part}_block_out_channels=[8, 8, 8, 8]" for part in ("encoder", "decoder"))
-UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.attention_head_dim=1",
-        "model.cross_attention_dim=16")  # fmt: skip
+UNET = (
+    "model.sample_size=4",
+    "model.block_out_channels=[16, 16, 16]",
+    "model.attention_head_dim=1",
+    "model.cross_attention_dim=16",
+)
 SPACED = tuple(f"model.{key}={json.dumps(value)}" for key, value in SPACE.items())
 VIEWS = ("objective.views=1.0", "sampler.sigma=0.75", "sampler.group=2")
 SETTINGS: dict[str, tuple[str, ...]] = {
@@ -51,7 +59,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     "touch_ldm": UNET,
     "language_model": ("model.hidden_size=16", "model.intermediate_size=24"),
     "touch_llm": ("bridge.intermediate_size=24",),
-}  # fmt: skip
+}
 NOT_LEARNED = ("known", "prototypes", "mean", "deviation")
 FROZEN = defaultdict(set, touch_llm={"language_model"}, image_vae={"features"}, touch_vae={"features"})
 """Parts of an objective that are not trained."""
@@ -112,10 +120,12 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
     stage(runs, "image_text", "--init", str(began), *changed, output="kept")
     made = UniTouchModel.from_pretrained(runs / "kept" / "model")
     assert made.known_modalities == ("image", "text")  # to which no touch and no sound is bound yet
-    assert made.config.sensor_reaches == made.config.ood_thresholds == {} and made.config.embedding_norm > 0
+    assert made.config.sensor_reaches == made.config.ood_thresholds == {}
+    assert made.config.embedding_norm > 0
     words = [UniTouchProcessor.from_pretrained(one).tokenizer.get_vocab() for one in (began, runs / "kept" / "model")]
     record = json.loads((runs / "kept" / "record.json").read_text())
-    assert words[0] == words[1] and record["started_from"] == {"seed": 3}
+    assert words[0] == words[1]
+    assert record["started_from"] == {"seed": 3}
     stage(runs, "image_vae", "--init", str(runs / "image_vae" / "model"), output="vae-again")
     assert json.loads((runs / "vae-again" / "record.json").read_text())["started_from"]["stage"] == "image_vae"
     with pytest.raises(SystemExit, match="2"):
@@ -145,12 +155,14 @@ def test_a_family_becomes_pictures_and_touches(family: Path) -> None:
     assert pipe.unitouch.config.sensors == ["digit"]  # sensors that were drawn have no name
     touch = World(0, image_size=32).render([0], [0], [0], modalities=("touch",), sensors=("digit",)).touch["digit"]
     picture = pipe(touch, num_inference_steps=2, output_type="np").images
-    assert picture.shape == (1, 32, 32, 3) and np.isfinite(picture).all()
+    assert picture.shape == (1, 32, 32, 3)
+    assert np.isfinite(picture).all()
     pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
     for drawn in ({"sensor": "digit"}, {"background": touch[0]}):
         made = pipe(text="rough brick", num_inference_steps=2, output_type="np", **drawn).images
-        assert made.shape == (1, 32, 32, 3) and np.isfinite(made).all()
+        assert made.shape == (1, 32, 32, 3)
+        assert np.isfinite(made).all()
     assert len(tiny("touch-to-text", family=family)(touch, "How does it feel?", max_new_tokens=4).texts) == 1
 
 
@@ -161,7 +173,8 @@ def test_every_weight_of_a_family_is_stored_in_half_precision_once(family: Path,
             kinds[path] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
     # the joint space; of pictures and of touches autoencoder and UNet; normaliser, bank, and untouched gels; language
     # model and bridge
-    assert len(kinds) == 10 and all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
+    assert len(kinds) == 10
+    assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
     stored = load_file(family / "joint" / "model.safetensors")
     for part in ("image_text", "touch", "texture", "audio"):  # each leaves what was there as it was
         state = load_file(runs / part / "model" / "model.safetensors")

@@ -12,7 +12,8 @@ def test_labels_are_the_answers_and_their_end(processor) -> None:
     tokenizer = make_language_parts()["tokenizer"]
     pairs = touch_llm.encoded(tokenizer, [[("How is it?", "rough."), ("ä?", "é")]])
     for row, (prompt, answer) in enumerate((("How is it?\n", "rough."), ("ä?\n", "é"))):
-        ids, labels = pairs["input_ids"][0, row], pairs["labels"][0, row]
+        ids = pairs["input_ids"][0, row]
+        labels = pairs["labels"][0, row]
         assert tokenizer.decode(labels[labels >= 0].tolist()) == answer + "</s>"
         assert tokenizer.decode(ids.tolist(), skip_special_tokens=True) == prompt + answer
 
@@ -21,13 +22,16 @@ def test_answers_are_true_of_the_world() -> None:
     world = World(3, image_size=64)
     names = torch.cartesian_prod(torch.arange(17), torch.arange(6), torch.arange(1)).T
     scene = world.render(*names, modalities=("attributes", "grasp", "text"))
-    draws, attributes = world.draw(*names), scene.attributes["gelsight"]
+    draws = world.draw(*names)
+    attributes = scene.attributes["gelsight"]
     for variant in range(2):
         for row, told in enumerate(answered(draws, attributes, variant)):
-            spec, measured = MATERIALS[int(names[0][row])], dict(zip(ATTRIBUTES, attributes[row].tolist(), strict=True))
+            spec = MATERIALS[int(names[0][row])]
+            measured = dict(zip(ATTRIBUTES, attributes[row].tolist(), strict=True))
             assert all(question in TOPICS[topic].questions for topic, (question, _) in told.items())
             known = told["material"][1] == f"it is {spec.name}."
-            assert known != (measured["cover"] < 0.12) and told["feel"][1].count(spec.feel[0]) == 1
+            assert known != (measured["cover"] < 0.12)
+            assert told["feel"][1].count(spec.feel[0]) == 1
             holds = told["grasp"][1] in ("yes, it would hold.", "no, it would hold.")
             assert holds == bool(scene.grasp[row] > 1)
             assert (told["grasp"][1][:3] == "yes") == (holds != ("slip" in told["grasp"][0]))

@@ -50,7 +50,8 @@ class Regression(nn.Module):
 def data(broken_row: int | None = None) -> ArrayDataset:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((ROWS, 3)).astype(np.float32)
-    weight, noise = rng.standard_normal((3, 2)), rng.standard_normal((ROWS, 2))
+    weight = rng.standard_normal((3, 2))
+    noise = rng.standard_normal((ROWS, 2))
     y = (x @ weight + 0.5 + 0.3 * noise).astype(np.float32)
     if broken_row is not None:
         y[broken_row] = np.nan
@@ -58,7 +59,8 @@ def data(broken_row: int | None = None) -> ArrayDataset:
 
 
 def make(output: Path, *, options: dict[str, Any] | None = None, **changes: Any) -> tuple[Trainer, Regression]:
-    objective, config = Regression(**(options or {})), CONFIG.model_copy(update=changes)
+    objective = Regression(**(options or {}))
+    config = CONFIG.model_copy(update=changes)
     indices_of = partial(shuffled_indices, size=ROWS, batch_size=config.batch_size, seed=config.seed)
     return Trainer(objective, data(), indices_of, config, output), objective
 
@@ -73,7 +75,8 @@ def test_training_reaches_the_closed_form_of_least_squares(tmp_path: Path) -> No
     np.testing.assert_allclose(objective.weights()[0].T, expected[:3], atol=1e-4)
     np.testing.assert_allclose(objective.weights()[1], expected[3], atol=1e-4)
     assert json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])["step"] == 250
-    assert not objective.training and make(tmp_path, steps=None, epochs=2.5)[0].steps == 15  # 2.5 * 48 / 8
+    assert not objective.training
+    assert make(tmp_path, steps=None, epochs=2.5)[0].steps == 15  # 2.5 * 48 / 8
 
 
 def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None:
@@ -92,7 +95,8 @@ def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None
 
 
 def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Path) -> None:
-    objective, config = Regression(), CONFIG.model_copy(update={"ema_decay": 0.9, "learning_rate": 0.3})
+    objective = Regression()
+    config = CONFIG.model_copy(update={"ema_decay": 0.9, "learning_rate": 0.3})
     objective.trained = nn.Sequential(nn.Linear(3, 4), norm := nn.BatchNorm1d(4), nn.Linear(4, 2))
     Trainer(objective, data(), lambda step: range(ROWS), config, tmp_path).fit()
     with torch.no_grad():
@@ -102,7 +106,8 @@ def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Pa
 
 
 def test_the_rate_warms_up_in_a_line_and_falls_as_half_a_cosine() -> None:
-    final, config = 0.1, CONFIG.model_copy(update={"warmup": 10, "final_rate": 0.1})
+    final = 0.1
+    config = CONFIG.model_copy(update={"warmup": 10, "final_rate": 0.1})
     np.testing.assert_allclose([rate_at(step, config, 110) for step in range(10)], np.arange(1, 11) / 10)
     expected = [1.0, final + (1 - final) * (1 + math.sqrt(0.5)) / 2, (1 + final) / 2, final, final]
     np.testing.assert_allclose([rate_at(step, config, 110) for step in (10, 35, 60, 110, 500)], expected, atol=1e-12)
@@ -167,7 +172,8 @@ def test_other_settings_of_the_optimiser_hold_after_going_on(tmp_path: Path) -> 
     again, _ = make(tmp_path, learning_rate=1e-4, weight_decay=0.5, beta2=0.9, ema_decay=0.99)
     again.resume()
     held = [(group["weight_decay"], group["betas"]) for group in again.optimizer.param_groups]
-    assert held == [(0.5, (0.9, 0.9)), (0.0, (0.9, 0.9))] and again.ema.decay == 0.99
+    assert held == [(0.5, (0.9, 0.9)), (0.0, (0.9, 0.9))]
+    assert again.ema.decay == 0.99
     assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, CONFIG, 20))
     again.train_step(data()[again.indices_of(10)])
     assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, CONFIG, 20))

@@ -11,7 +11,8 @@ from unitouch_gen.world.grids import pixel_axis
 
 VIEW, SIZE = 16.0, 128
 AXIS = pixel_axis(SIZE, VIEW)
-X, Y = AXIS[None, :].expand(SIZE, -1), AXIS[:, None].expand(-1, SIZE)
+X = AXIS[None, :].expand(SIZE, -1)
+Y = AXIS[:, None].expand(-1, SIZE)
 
 
 def measured(indentation: torch.Tensor, compliance: float = 0.0) -> dict[str, float]:
@@ -20,7 +21,10 @@ def measured(indentation: torch.Tensor, compliance: float = 0.0) -> dict[str, fl
 
 
 def test_of_a_ball() -> None:
-    radius, depth, x, y = 6.0, 0.5, 2.0, -1.0
+    radius = 6.0
+    depth = 0.5
+    x = 2.0
+    y = -1.0
     ball = (radius**2 - (X - x) ** 2 - (Y - y) ** 2).clamp_min(0.0).sqrt() - radius
     found = measured((ball + depth).clamp_min(0.0), 0.3)
     rim = math.sqrt(2 * radius * depth - depth**2)
@@ -45,7 +49,8 @@ def test_of_waves(angle: float) -> None:
     assert found["steepness"] == pytest.approx(0.5 * math.log(slope**2 + 1e-3), abs=0.03)
     assert (found["grain x"], found["grain y"]) == pytest.approx((math.cos(2 * angle), math.sin(2 * angle)), abs=0.03)
     shorter = measured(height * torch.cos(4 * math.pi / period * X) + 2 * height)
-    assert shorter["fine relief"] > found["fine relief"] and shorter["coarse relief"] < found["coarse relief"]
+    assert shorter["fine relief"] > found["fine relief"]
+    assert shorter["coarse relief"] < found["coarse relief"]
 
 
 def test_of_nothing_touched() -> None:
@@ -63,7 +68,8 @@ def test_maps_of_a_slope_and_of_waves() -> None:
     torch.testing.assert_close(slope_y, torch.full_like(slope_y, -0.05), rtol=0, atol=1e-4)
     wave = 0.1 * torch.sin(math.pi * X) + 1.0  # a period in each cell
     _, mean, _, steep = contact_maps(wave[None], VIEW)[0, :, 1:-1, 1:-1]
-    assert mean.abs().max() < 0.02 and steep.exp().mean() == pytest.approx((0.1 * math.pi) ** 2 / 2, rel=0.06)
+    assert mean.abs().max() < 0.02
+    assert steep.exp().mean() == pytest.approx((0.1 * math.pi) ** 2 / 2, rel=0.06)
 
 
 def test_the_blur_is_scipys() -> None:

@@ -50,7 +50,9 @@ def test_captions_name_the_material_or_how_it_feels_and_never_begin_as_the_promp
 
 
 def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
-    made, bounds, said = drawn(range(60)), [0.0, *HARDNESS_WORDS.values()], set()
+    made = drawn(range(60))
+    bounds = [0.0, *HARDNESS_WORDS.values()]
+    said = set()
     for text, compliance in zip(described(made), made.compliance.tolist(), strict=True):
         for place, word in enumerate(HARDNESS_WORDS):
             if word in re.split(r"[ ,]+", text):
@@ -60,7 +62,12 @@ def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
 
 
 def test_words_of_directions_and_colours() -> None:
-    for angle, word in ((0.05, "side to side"), (3.1, "side to side"), (1.5, "up and down"), (0.8, "down to the right"),
-                        (-0.8, "up to the right")):  # fmt: skip
+    for angle, word in (
+        (0.05, "side to side"),
+        (3.1, "side to side"),
+        (1.5, "up and down"),
+        (0.8, "down to the right"),
+        (-0.8, "up to the right"),
+    ):
         assert word in direction_word(angle)
     assert [colour_name(torch.tensor(rgb)) for rgb in COLOURS.values()] == [*COLOURS]

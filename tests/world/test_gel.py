@@ -55,7 +55,8 @@ def test_a_ball_touches_a_disc_at_any_height() -> None:
     axis = pixel_axis(512)
     ball = ((900.0 - axis[:, None] ** 2 - axis[None, :] ** 2).sqrt() - 23.0)[None]
     indentation = in_view(gel_indentation(ball, torch.tensor([0.5]), PLAIN, 256), 256)
-    assert indentation.max() == pytest.approx(0.5) and indentation.min() == 0.0
+    assert indentation.max() == pytest.approx(0.5)
+    assert indentation.min() == 0.0
     rim = 30.0**2 - 29.5**2  # squared radius of a cap of 0.5 mm
     assert (indentation > 0.0).float().mean().item() == pytest.approx(math.pi * rim / PLAIN.field_of_view**2, rel=0.01)
 

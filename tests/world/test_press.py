@@ -57,9 +57,12 @@ def test_integers_are_a_share_of_their_range_and_floats_are_mm(tmp_path: Path) -
     Image.fromarray((1.5 * share).astype(np.float32)).save(tmp_path / "float.tif")
     np.save(tmp_path / "float.npy", 1.5 * share)
     for name, relief, error in (
-        ("deep.png", 1.5, 1e-3), ("eight.png", 1.5, 8e-3), ("grey.png", 1.5, 8e-3), ("float.tif", 1.0, 1e-4),
+        ("deep.png", 1.5, 1e-3),
+        ("eight.png", 1.5, 8e-3),
+        ("grey.png", 1.5, 8e-3),
+        ("float.tif", 1.0, 1e-4),
         ("float.npy", 1.0, 1e-4),
-    ):  # fmt: skip
+    ):
         made = press(tmp_path / name, 16.0, SHARP, 0.8, relief_mm=relief, seed=None).depth
         torch.testing.assert_close(made, expected, rtol=0, atol=error)
     image = Image.open(tmp_path / "deep.png")
@@ -76,15 +79,20 @@ def test_several_contacts_are_those_of_one_at_a_time() -> None:
         torch.testing.assert_close(both.touch[row], one.touch[0], rtol=0, atol=1e-5)
     moved = press(maps[0], 20.0, SHARP, 0.5, at=[(3.0, -2.0)], seed=None).depth[0]
     axis = 16.0 * (torch.arange(128) + 0.5) / 128 - 8.0
-    x, y = (moved * axis).sum() / moved.sum(), (moved * axis[:, None]).sum() / moved.sum()
+    x = (moved * axis).sum() / moved.sum()
+    y = (moved * axis[:, None]).sum() / moved.sum()
     assert (x.item(), y.item()) == (pytest.approx(-3.0, abs=0.05), pytest.approx(2.0, abs=0.05))
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_every_sensor_sees_the_coin_with_the_noise_of_its_camera(sensor: str) -> None:
     quiet, one, same, other = (press(example("coin", "height"), 24.0, sensor, seed=seed) for seed in (None, 0, 0, 1))
-    assert one.touch.shape == (1, 3, 128, 128) and one.touch.min() >= 0.0 and one.touch.max() <= 1.0
-    assert torch.equal(one.touch, same.touch) and not torch.equal(one.touch, other.touch)
+    assert one.touch.shape == (1, 3, 128, 128)
+    assert one.touch.min() >= 0.0
+    assert one.touch.max() <= 1.0
+    assert torch.equal(one.touch, same.touch)
+    assert not torch.equal(one.touch, other.touch)
     assert (one.touch - quiet.touch).std().item() == pytest.approx(SENSORS[sensor].noise, rel=0.1)
-    assert torch.equal(one.depth, quiet.depth) and 0.4 < one.depth.max() < 1.5
+    assert torch.equal(one.depth, quiet.depth)
+    assert 0.4 < one.depth.max() < 1.5
     assert (quiet.touch[0] - untouched_gel(SENSORS[sensor], 128)).abs().max() > 0.1

@@ -17,8 +17,12 @@ def test_takes_of_one_kind_of_hit_are_on_one_side_of_the_split() -> None:
     splits = defaultdict[str, set[str]](set)
     for one in recordings():
         splits[one.group].add(one.split)
-        assert one.licence.startswith("CC0") and one.author and one.source and one.material in MATERIAL_NAMES
-    assert all(len(names) == 1 for names in splits.values()) and len(splits) == 18
+        assert one.licence.startswith("CC0")
+        assert one.author
+        assert one.source
+        assert one.material in MATERIAL_NAMES
+    assert all(len(names) == 1 for names in splits.values())
+    assert len(splits) == 18
     assert {f"{one.name}.flac" for one in recordings()} == {file.name for file in (COLLECTION / "sounds").iterdir()}
     held_out = {one.material for one in recordings() if one.split == "test"}
     assert held_out == {"wood", "metal", "glass", "tile"}
@@ -28,17 +32,21 @@ def test_takes_of_one_kind_of_hit_are_on_one_side_of_the_split() -> None:
 def test_recordings_begin_at_once_and_are_heard() -> None:
     for one in recordings():
         loud = np.abs(one.samples)
-        assert one.samples.ndim == 1 and 0.05 < len(loud) / SAMPLE_RATE <= 0.6 and 0.89 < loud.max() < 0.91
+        assert one.samples.ndim == 1
+        assert 0.05 < len(loud) / SAMPLE_RATE <= 0.6
+        assert 0.89 < loud.max() < 0.91
         assert loud[:32].max() > 0.02
 
 
 def test_a_share_of_sounds_is_recorded_and_the_others_stay() -> None:
     world = World(recordings=0.5)
-    draws, plain = world.draw(*NAMES), torch.rand(68, 4160) - 0.5
+    draws = world.draw(*NAMES)
+    plain = torch.rand(68, 4160) - 0.5
     made = with_recordings(0, draws, plain, 0.5)
     changed = (made != plain).any(dim=1)
     named = [recording_of(0, name, 0.5) for name in draws.names()]
-    assert changed.tolist() == [one is not None for one in named] and 8 < changed.sum() < 30
+    assert changed.tolist() == [one is not None for one in named]
+    assert 8 < changed.sum() < 30
     for one, (material, object_, _) in zip(named, draws.names(), strict=True):
         if one is not None:
             assert one.material == MATERIAL_NAMES[material]
@@ -47,7 +55,9 @@ def test_a_share_of_sounds_is_recorded_and_the_others_stay() -> None:
     scene = world.render(*NAMES, modalities=("audio",))
     assert scene.recording == [one.name if one else None for one in named]
     assert torch.equal(scene.audio, world.render(*NAMES, modalities=("audio",)).audio)
-    assert scene.audio.shape == plain.shape and scene.audio.abs().max() <= 1.0 and scene.audio.isfinite().all()
+    assert scene.audio.shape == plain.shape
+    assert scene.audio.abs().max() <= 1.0
+    assert scene.audio.isfinite().all()
 
 
 def test_a_recording_sounds_like_itself() -> None:
@@ -58,8 +68,10 @@ def test_a_recording_sounds_like_itself() -> None:
     for row, name in enumerate(draws.names()):
         if (one := recording_of(0, name, 1.0)) is not None:
             raw = np.pad(one.samples, (0, 4160))[:4160]
-            centres = [(np.abs(np.fft.rfft(sound)) ** 2 @ hz) / (np.abs(np.fft.rfft(sound)) ** 2).sum()
-                       for sound in (raw, made[row].numpy())]  # fmt: skip
+            centres = [
+                (np.abs(np.fft.rfft(sound)) ** 2 @ hz) / (np.abs(np.fft.rfft(sound)) ** 2).sum()
+                for sound in (raw, made[row].numpy())
+            ]
             assert 0.8 < centres[1] / centres[0] < 1.25
             assert made[row].abs().max().item() == np.float32(0.9)
 
@@ -70,7 +82,8 @@ def test_files_clip_some_sounds_and_keep_them_in_place() -> None:
     plain = (0.8 * torch.sin(2 * torch.pi * 700 * time) * torch.exp(-20 * time)).expand(40, -1).clone()
     filed = as_files(0, names, plain)
     same = (filed == plain).all(dim=1)
-    assert 8 < same.sum() < 32 and torch.equal(filed, as_files(0, names, plain))
+    assert 8 < same.sum() < 32
+    assert torch.equal(filed, as_files(0, names, plain))
     clipped = filed.abs().amax(dim=1) < 0.75 * plain.abs().max()
     assert 2 < clipped.sum() < 20
     for sound in filed[~same & ~clipped]:  # of a codec alone: no delay, little error

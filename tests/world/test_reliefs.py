@@ -25,7 +25,8 @@ def test_a_finer_grid_is_the_trigonometric_interpolant(resolution: int) -> None:
     spectrum = np.fft.rfft2(np.random.default_rng(0).standard_normal((16, 16)))
     spectrum[8], spectrum[:, 8] = 0.0, 0.0  # of a field without its Nyquist row and column
     field = np.fft.irfft2(spectrum, (16, 16))
-    coefficients, modes = np.fft.fft2(field) / 16**2, np.fft.fftfreq(16, 1 / 16)
+    coefficients = np.fft.fft2(field) / 16**2
+    modes = np.fft.fftfreq(16, 1 / 16)
     centres = (np.arange(resolution) + 0.5) / resolution - 0.5 / 16  # shares of the side from the first coarse centre
     basis = np.exp(2j * np.pi * np.outer(centres, modes))  # (fine points, modes)
     padded = zero_pad_spectrum(torch.fft.rfft2(torch.from_numpy(field)[None]), resolution)
@@ -63,16 +64,19 @@ def test_noise_is_stretched_along_the_grain_shifted_and_scaled() -> None:
 
 
 def test_cell_distances_are_those_of_a_k_d_tree() -> None:
-    size, made = 2.1, unit_fields(256)
+    size = 2.1
+    made = unit_fields(256)
     i, j = torch.meshgrid(torch.arange(-60.0, 60.0), torch.arange(-60.0, 60.0), indexing="xy")
-    a, b = hash_unit(i, j, made.cell_seed[0]), hash_unit(j, i, made.cell_seed[0] + 17)
+    a = hash_unit(i, j, made.cell_seed[0])
+    b = hash_unit(j, i, made.cell_seed[0] + 17)
     seeds = torch.stack([i + a, j + b], dim=-1).reshape(-1, 2)
     points = torch.stack([made.x[0], made.y[0]], dim=-1).reshape(-1, 2) / size
     expected, nearest = cKDTree(seeds.numpy()).query(points.numpy(), k=2)
     first, second, label = (part[0].flatten().numpy() for part in made.cells(size))
     np.testing.assert_allclose(first, expected[:, 0], atol=1e-5)
     excess = second - expected[:, 1]
-    assert excess.min() > -1e-5 and (excess > 1e-5).mean() <= 1e-3  # seeds beyond the 3 x 3 squares searched
+    assert excess.min() > -1e-5
+    assert (excess > 1e-5).mean() <= 1e-3  # seeds beyond the 3 x 3 squares searched
     assert np.isclose(label, a.flatten().numpy()[nearest[:, 0]], atol=1e-6).mean() > 0.999  # ties fall either way
 
 

@@ -39,8 +39,11 @@ def test_every_surface_has_its_files_and_a_licence_that_lets_it_ship() -> None:
     expected = set()
     for one in scanned_surfaces():
         expected |= {f"{one.name}{COLOURS}"} | ({f"{one.name}{HEIGHTS}"} if one.heights != "none" else set())
-        assert one.licence.startswith(("CC0", "MIT")) and "3dtextures" not in one.licence + one.source
-        assert one.source and one.author and one.material in MATERIAL_NAMES
+        assert one.licence.startswith(("CC0", "MIT"))
+        assert "3dtextures" not in one.licence + one.source
+        assert one.source
+        assert one.author
+        assert one.material in MATERIAL_NAMES
         assert one.heights in ("measured", "computed", "none")
     assert {file.name for file in (COLLECTION / "surfaces").iterdir()} == expected
     assert sum(file.stat().st_size for file in COLLECTION.rglob("*.*")) <= 12e6
@@ -51,7 +54,9 @@ def test_every_material_but_two_is_held_out_in_part() -> None:
     assert {one.material for one in felt} == set(MATERIAL_NAMES) - WITHOUT
     assert {one.material for one in felt if one.split == "test"} == set(MATERIAL_NAMES) - WITHOUT
     counts = Counter(one.split for one in felt)
-    assert 35 <= counts["test"] <= 48 and 10 <= counts["val"] <= 20 and counts["train"] > 200
+    assert 35 <= counts["test"] <= 48
+    assert 10 <= counts["val"] <= 20
+    assert counts["train"] > 200
     per_material = Counter(one.material for one in felt if one.split == "test")
     assert max(per_material.values()) <= 6  # no figure is of one material
 
@@ -68,9 +73,11 @@ def test_twins_are_on_one_side_of_the_split() -> None:
         own = [one for one in found if one.material == name]
         pictures = [Image.open(COLLECTION / "surfaces" / f"{one.name}{COLOURS}") for one in own]
         pairs += [(own[a], own[b]) for a, b in builder.same_texture(pictures, 0.72)] if own else []
-    assert len(pairs) >= 4 and all(a.split == b.split for a, b in pairs)
+    assert len(pairs) >= 4
+    assert all(a.split == b.split for a, b in pairs)
     stem = builder.stem_of
-    assert stem("bricks075a") == stem("Bricks_075b") != stem("bricks076a") and stem("rock_01") == stem("rock01")
+    assert stem("bricks075a") == stem("Bricks_075b") != stem("bricks076a")
+    assert stem("rock_01") == stem("rock01")
     assert stem("bark-001") == stem("bark_01") != stem("bark_02")
     kept = Counter(stem(one.name.partition("__")[2].partition("_")[2]) for one in found)
     assert sum(kept.values()) == len(found)
@@ -108,7 +115,8 @@ def test_a_scan_is_read_where_it_is_asked_for(mode: str) -> None:
     values = torch.arange(256.0).expand(2, 256)
     angle = 0.7
     u, v = torch.meshgrid(torch.linspace(-0.2, 0.2, 33), torch.linspace(-0.2, 0.2, 33), indexing="xy")
-    x, y = 0.5 + math.cos(angle) * u - math.sin(angle) * v, 0.5 + math.sin(angle) * u + math.cos(angle) * v
+    x = 0.5 + math.cos(angle) * u - math.sin(angle) * v
+    y = 0.5 + math.sin(angle) * u + math.cos(angle) * v
     found = sampled(image, values, torch.stack([x, y], dim=-1), mode)
     expected = 2 * (torch.stack([x, y]) * size - 0.5)  # a level is that of its pixel's centre
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3 if mode == "bilinear" else 0.15)  # its kernel's own
@@ -129,7 +137,8 @@ def test_objects_show_the_surfaces_of_their_split_and_all_of_them() -> None:
         assert seen[split] == {one for material in KNOWN for one in surfaces_of(material, split)}
     assert all(scanned_surfaces()[number].heights != "none" for numbers in seen.values() for number in numbers)
     shares = [sum(surface_of(0, material, one, 0.5) >= 0 for one in range(100)) for material in range(17)]
-    assert shares[MATERIAL_NAMES.index("concrete")] == 50 and shares[MATERIAL_NAMES.index("glass")] == 0
+    assert shares[MATERIAL_NAMES.index("concrete")] == 50
+    assert shares[MATERIAL_NAMES.index("glass")] == 0
     assert shares[MATERIAL_NAMES.index("paper")] == 20  # two surfaces: few objects, or they would be learnt by heart
     computed = [scanned_surfaces()[surface_of(0, KNOWN[0], one, 1.0)].heights for one in range(55)]
     assert computed.count("computed") < 0.5 * len(computed)  # of concrete, two of three are
@@ -141,7 +150,8 @@ def test_drawn_objects_stay_as_they_are_beside_scanned_ones() -> None:
     plain = World(image_size=32).render(*names, **every)
     mixed = World(image_size=32, scanned=0.5).render(*names, **every)
     drawn = torch.tensor([name is None for name in mixed.surface])
-    assert 5 < drawn.sum() < 16 and plain.surface == [None] * len(drawn)
+    assert 5 < drawn.sum() < 16
+    assert plain.surface == [None] * len(drawn)
     assert torch.equal(plain.image[drawn], mixed.image[drawn])
     assert torch.equal(plain.touch["digit"][drawn], mixed.touch["digit"][drawn])
     assert not torch.isclose(plain.image[~drawn], mixed.image[~drawn]).flatten(1).all(dim=1).any()
@@ -163,18 +173,22 @@ def test_the_grain_that_is_said_is_the_grain_that_is_felt() -> None:
     kept = draws.grained & clear & (draws.shape == list(SHAPES).index("flat"))
     assert kept.sum() >= 8
     agreement = -torch.cos(across - 2 * draws.angle)[kept]  # slopes are steepest across a grain
-    assert agreement.median() > 0.8 and (agreement > 0.0).float().mean() > 0.85
+    assert agreement.median() > 0.8
+    assert (agreement > 0.0).float().mean() > 0.85
 
 
 def test_lengths_are_in_the_range_that_is_told() -> None:
     world = World(image_size=32, scanned=1.0)
     draws = world.draw(*contacts([0, 1, 600]))
-    assert draws.scan_side.min() >= 25.0 and draws.scan_side.max() <= 150.0
+    assert draws.scan_side.min() >= 25.0
+    assert draws.scan_side.max() <= 150.0
     flat = draws.shape == list(SHAPES).index("flat")
     height = surfaces(0, draws, 64, coloured=False).height[flat]
     relief = height.flatten(1).std(dim=1)
-    assert relief.median() > 0.05 and relief.max() < 1.2
-    assert draws.colour.min() >= 0.02 and draws.colour.max() <= 0.98
+    assert relief.median() > 0.05
+    assert relief.max() < 1.2
+    assert draws.colour.min() >= 0.02
+    assert draws.colour.max() <= 0.98
 
 
 def test_what_is_said_of_a_scan_is_measured_of_it() -> None:
@@ -182,10 +196,13 @@ def test_what_is_said_of_a_scan_is_measured_of_it() -> None:
     names = [MATERIAL_NAMES[number] for number in draws.material.tolist()]
     for variant in range(4):
         for text, name in zip(described(draws, variant), names, strict=True):
-            assert name in text and "regular" not in text and "coarse " not in text
+            assert name in text
+            assert "regular" not in text
+            assert "coarse " not in text
     told = answered(draws, torch.ones(len(draws), len(ATTRIBUTES)))
     for one, grained in zip(told, draws.grained.tolist(), strict=True):
-        assert ("running" in one["grain"][1]) == grained and "bumps" not in one["feel"][1]
+        assert ("running" in one["grain"][1]) == grained
+        assert "bumps" not in one["feel"][1]
 
 
 def test_photos_are_of_the_same_contacts_under_a_light_of_their_own() -> None:
@@ -193,8 +210,11 @@ def test_photos_are_of_the_same_contacts_under_a_light_of_their_own() -> None:
     worlds = [World(image_size=32, scanned=1.0, photographic=share) for share in (0.0, 0.5, 1.0, 1.0)]
     plain, some, photos, again = (world.render(*names, modalities=("image",)).image for world in worlds)
     changed = (some != plain).flatten(1).any(dim=1)
-    assert 3 < changed.sum() < 13 and torch.equal(photos, again) and (photos != plain).flatten(1).any(dim=1).all()
-    assert photos.min() >= 0.0 and photos.max() <= 1.0
+    assert 3 < changed.sum() < 13
+    assert torch.equal(photos, again)
+    assert (photos != plain).flatten(1).any(dim=1).all()
+    assert photos.min() >= 0.0
+    assert photos.max() <= 1.0
     alike = [
         np.corrcoef(a.mean(dim=0).ravel(), b.mean(dim=0).ravel())[0, 1] for a, b in zip(plain, photos, strict=True)
     ]
@@ -207,7 +227,8 @@ def test_colours_alone_are_pictures_of_flat_surfaces() -> None:
     world = World(image_size=32, scanned=1.0, colours_alone=True)
     draws = world.draw(*names)
     alone = torch.tensor([scanned_surfaces()[number].heights == "none" for number in draws.surface.tolist()])
-    assert alone.any() and not alone.all()
+    assert alone.any()
+    assert not alone.all()
     flat = alone & (draws.shape == list(SHAPES).index("flat"))
     height = surfaces(0, draws.but(tilt=0 * draws.tilt), 64, coloured=False).height
     assert height[flat].std(dim=(1, 2)).max() < 1e-5

@@ -36,7 +36,9 @@ def close(one: Scene, other: Scene, rows: slice = slice(None), atol: float = 1e-
 
 def test_every_modality_is_finite_and_in_range(gallery: Scene) -> None:
     for images in (gallery.image, *gallery.touch.values()):
-        assert images.shape == (68, 3, 32, 32) and images.min() >= 0.0 and images.max() <= 1.0
+        assert images.shape == (68, 3, 32, 32)
+        assert images.min() >= 0.0
+        assert images.max() <= 1.0
     assert gallery.audio.abs().max() <= 1.0
     for values in (*gallery.depth.values(), *gallery.attributes.values(), gallery.audio, gallery.grasp):
         assert torch.isfinite(values).all()
@@ -60,7 +62,8 @@ def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, moda
     surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": []}
     others = [name for name in SCENE_MODALITIES if name != modality]
     assert made.left_out == others + surfaces.get(modality, ["colours of surfaces"])
-    found, expected = getattr(made, modality), getattr(gallery, modality)
+    found = getattr(made, modality)
+    expected = getattr(gallery, modality)
     for name, values in found.items() if isinstance(found, dict) else ():
         torch.testing.assert_close(values, expected[name][:5], rtol=0, atol=1e-3)
     if isinstance(found, torch.Tensor):
@@ -68,8 +71,10 @@ def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, moda
 
 
 def test_touch_images_are_of_surfaces_that_yield_and_have_the_noise_of_their_camera() -> None:
-    world, quiet = small(), replace(SENSORS["digit"], noise=0.0)
-    drawn, names = world.draw(*NAMES), {"modalities": ("touch",)}
+    world = small()
+    quiet = replace(SENSORS["digit"], noise=0.0)
+    drawn = world.draw(*NAMES)
+    names = {"modalities": ("touch",)}
     stiff = 1.0 - YIELD * drawn.compliance
     height = surfaces(0, drawn, world.resolution).height * stiff[:, None, None]
     expected = touch_images(height, drawn.indentation_depth * stiff, drawn.dwell, quiet, 32)

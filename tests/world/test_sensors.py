@@ -54,7 +54,8 @@ def touch(height: torch.Tensor, depth: float, sensor: Sensor, dwell: float = 0.5
 
 @pytest.mark.parametrize("sensor", SOME)
 def test_a_gel_is_untouched_before_contact_before_time_and_where_nothing_is_near(sensor: Sensor) -> None:
-    untouched, rough = untouched_gel(sensor, 64), torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
+    untouched = untouched_gel(sensor, 64)
+    rough = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
     for image in (touch(rough, -3.0, sensor), touch(rough, 1.0, sensor, dwell=0.0)):
         torch.testing.assert_close(image[0], untouched, rtol=0.0, atol=1e-6)
     if not sensor.marker_pitch:
@@ -63,7 +64,8 @@ def test_a_gel_is_untouched_before_contact_before_time_and_where_nothing_is_near
 
 
 def test_a_flat_full_contact_shows_no_slopes_and_a_dome_is_touched_in_its_middle_first() -> None:
-    flat, untouched = torch.zeros(1, 128, 128), untouched_gel(PLAIN, 64)
+    flat = torch.zeros(1, 128, 128)
+    untouched = untouched_gel(PLAIN, 64)
     torch.testing.assert_close(touch(flat, 1.0, PLAIN)[0], untouched, rtol=0, atol=1e-5)
     change = (touch(flat, 0.3, replace(PLAIN, dome=1.0))[0] - untouched).abs().sum(dim=0)
     assert change[20:44, 20:44].mean() > 5 * change[:8].mean()
@@ -73,7 +75,8 @@ def test_markers_only_darken_and_move_alike_on_both_sides_of_a_ball() -> None:
     axis = pixel_axis(128)
     ball = (30.0**2 - axis[None, :] ** 2 - axis[:, None] ** 2).sqrt()[None]
     bare, dots = (touch(ball, 1.0, sensor, size=66) for sensor in (PLAIN, MARKED))
-    assert (dots <= bare + 1e-6).all() and (dots < bare - 0.05).any()
+    assert (dots <= bare + 1e-6).all()
+    assert (dots < bare - 0.05).any()
     shade = dots / bare  # the lights are not alike on both sides, but what the markers take is
     torch.testing.assert_close(shade, shade.flip(-1), rtol=0, atol=2e-3)
 
@@ -81,10 +84,13 @@ def test_markers_only_darken_and_move_alike_on_both_sides_of_a_ball() -> None:
 @pytest.mark.parametrize("sensor", SOME)
 def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor: Sensor) -> None:
     height = torch.zeros(3, 128, 128)
-    height[0, 64, 64], height[1, :, 64:] = -1e4, 1e14
+    height[0, 64, 64] = -1e4
+    height[1, :, 64:] = 1e14
     for depth, dwell in ((1e-6, 1e6), (1.0, 1e-6), (1e30, 1e6)):
         image = touch(height, depth, sensor, dwell)
-        assert torch.isfinite(image).all() and image.min() >= 0.0 and image.max() <= 1.0
+        assert torch.isfinite(image).all()
+        assert image.min() >= 0.0
+        assert image.max() <= 1.0
 
 
 def test_every_value_of_a_calibrated_sensor_has_one_provenance_and_every_source_a_licence() -> None:
@@ -101,7 +107,8 @@ def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:
     for sensor in MANY:
         assert 2 <= len(sensor.azimuths) == len(sensor.colours) == len(sensor.gradients) <= 6
         assert all(10.0 <= elevation <= 60.0 for elevation in sensor.elevation)
-        assert 0.8 <= sensor.thickness <= 4.0 and 10.0 <= sensor.field_of_view <= 20.0
+        assert 0.8 <= sensor.thickness <= 4.0
+        assert 10.0 <= sensor.field_of_view <= 20.0
         assert all(0.0 <= value <= 1.0 for colour in sensor.colours for value in colour)
     assert 0.15 < sum(sensor.marker_pitch > 0 for sensor in MANY) / len(MANY) < 0.35
     assert all(abs(draw_sensor(0, number, near=14.0).field_of_view - 14.0) <= 14.0 / 8 for number in range(50))

@@ -12,7 +12,8 @@ from unitouch_gen.world.grids import PATCH_MM, pixel_axis
 from unitouch_gen.world.surfaces import GAMMA, Surfaces, pictures, surfaces
 
 AXIS = pixel_axis(257)
-X, Y = AXIS[None, :].expand(257, -1), AXIS[:, None].expand(-1, 257)
+X = AXIS[None, :].expand(257, -1)
+Y = AXIS[:, None].expand(-1, 257)
 
 
 def solid(name: str, size: float, numbers: tuple[float, float, float]) -> Tensor:
@@ -24,8 +25,10 @@ def test_heights_are_finite_and_the_top_is_near_zero(name: str) -> None:
     for size in (0.5, 3.0, 12.0):
         for numbers in ((0.0, 0.0, 0.0), (0.3, 0.7, 0.5), (0.99, 0.99, 0.99)):
             height = solid(name, size, numbers)
-            assert torch.isfinite(height).all() and height.min() >= NOTHING - 5.0
-            assert -0.5 < height.max() < 1.6 and height.clamp_min(-2.0).std() > 1e-3  # none is a plane
+            assert torch.isfinite(height).all()
+            assert height.min() >= NOTHING - 5.0
+            assert -0.5 < height.max() < 1.6
+            assert height.clamp_min(-2.0).std() > 1e-3  # none is a plane
 
 
 def test_a_ball_is_a_sphere_a_rod_a_cylinder_and_a_ring_a_torus() -> None:
@@ -35,7 +38,8 @@ def test_a_ball_is_a_sphere_a_rod_a_cylinder_and_a_ring_a_torus() -> None:
         ("rod", 2.0, (0.25, 0.5, 0.0), Y.abs(), 2.0, (X.abs() < 6.0) & (Y.abs() < 1.9)),  # 2 (1 + 8 / 4) to a side
         ("ring", 6.0, (0.5, 0.0, 0.0), torch.hypot(X, Y) - 6.0, tube, (torch.hypot(X, Y) - 6.0).abs() < 0.95 * tube),
     ):
-        height, expected = solid(name, size, numbers), (radius**2 - away**2).clamp_min(0.0).sqrt() - radius
+        height = solid(name, size, numbers)
+        expected = (radius**2 - away**2).clamp_min(0.0).sqrt() - radius
         torch.testing.assert_close(height[inside], expected[inside], rtol=0, atol=1e-5)
         assert (height[torch.hypot(X, Y) > 8.6] == NOTHING).all()
 
@@ -43,9 +47,14 @@ def test_a_ball_is_a_sphere_a_rod_a_cylinder_and_a_ring_a_torus() -> None:
 def test_a_body_is_nothing_beside_itself_and_a_surface_without_colours_the_same() -> None:
     grid = torch.cartesian_prod(torch.arange(17), torch.arange(12))
     drawn = draw(0, grid[:, 0], grid[:, 1], torch.arange(len(grid)) % 3)
-    built, bare = surfaces(0, drawn, 128), surfaces(0, drawn, 128, coloured=False)
-    assert torch.equal(bare.height, built.height) and torch.equal(bare.body, built.body) and bare.albedo is None
-    assert torch.isfinite(built.height).all() and built.albedo.min() >= 0.0 and built.albedo.max() <= 1.0
+    built = surfaces(0, drawn, 128)
+    bare = surfaces(0, drawn, 128, coloured=False)
+    assert torch.equal(bare.height, built.height)
+    assert torch.equal(bare.body, built.body)
+    assert bare.albedo is None
+    assert torch.isfinite(built.height).all()
+    assert built.albedo.min() >= 0.0
+    assert built.albedo.max() <= 1.0
     reach = drawn.shape_offset.abs().amax(dim=1) + drawn.shape_radius
     whole = (drawn.shape == list(SHAPES).index("ball")) & (reach < 16.0) & (drawn.shape_radius < 8.0)
     area = torch.pi * drawn.shape_radius[whole] ** 2 / PATCH_MM**2
@@ -56,9 +65,10 @@ def picture(height=None, albedo=0.4, behind=False, light=(0.0, 0.0, 1.0), gloss=
     """Of a surface (32, 32), level if left out, (3, 16, 16)."""
     height = torch.zeros(32, 32) if height is None else height
     seen = Surfaces(
-        height[None], torch.tensor(albedo).expand(3)[None, :, None, None].expand(1, 3, 32, 32),
+        height[None],
+        torch.tensor(albedo).expand(3)[None, :, None, None].expand(1, 3, 32, 32),
         torch.full((1, 32, 32), float(not behind)),
-    )  # fmt: skip
+    )
     toward = torch.tensor([light]) / math.dist(light, (0, 0, 0))
     return pictures(seen, toward, torch.tensor([gloss]), torch.tensor([white]), torch.tensor([PATCH_MM]), 16)[0]
 

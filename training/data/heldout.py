@@ -5,6 +5,7 @@ from dataclasses import replace
 from hashlib import sha256
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,21 +29,27 @@ def world_contacts(
     cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str, *, grasps: bool = False
 ) -> Contacts:
     """Contacts of a split of the world, rendered once into `cache`; with the label "grasp", if asked for."""
-    seen, size = drawn(cache, source, split, processor), processor.image_size
+    seen = drawn(cache, source, split, processor)
+    size = processor.image_size
 
     def sounds() -> list[tuple[Tensor, int]]:
         return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
-    labels, classes = {**seen.labels}, {**seen.classes}
+    labels = {**seen.labels}
+    classes = {**seen.classes}
     if grasps:
         margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
-        labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
+        labels["grasp"] = (torch.cat(margins) > 1.0).long()
+        classes["grasp"] = ("dropped", "lifted")
     return replace(
-        seen, labels=labels, classes=classes, sounds=sounds,
+        seen,
+        labels=labels,
+        classes=classes,
+        sounds=sounds,
         relit=lambda: float_pixels(relit(cache, source, split, seen)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
         asked=lambda: asked_of(source.world().draw(*source.contacts(split)), seen.attributes[:, 0]),
-    )  # fmt: skip
+    )
 
 
 def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet) -> Contacts:
@@ -50,20 +57,23 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     modalities = modalities_of(data)
     gel = ["gel"] if all(has(record, "gel") for record in data.records) else []
     seen = decoded(cache, data, processor, ["touch", *gel, *modalities])
-    known = {"caption": list(seen.text)} if "text" in modalities else {}
+    answers = {"caption": list(seen.text)} if "text" in modalities else {}
     if bool((seen.material >= 0).all()):
-        known["material"] = [f"it is {data.classes['material'][label]}." for label in seen.material.tolist()]
-    asked = [
-        {topic: (TOPICS[topic].questions[0], [answers[row]]) for topic, answers in known.items()}
-        for row in range(len(data) if known else 0)
-    ]
-    sounds = (lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None
-    return replace(seen, sounds=sounds, asked=lambda: asked)
+        names = data.classes["material"]
+        answers["material"] = [f"it is {names[label]}." for label in seen.material.tolist()]
+    asked = []
+    for row in range(len(data) if answers else 0):
+        asked.append({topic: (TOPICS[topic].questions[0], [texts[row]]) for topic, texts in answers.items()})
+
+    def sounds() -> list[Any]:
+        return [sound_of(record, data) for record in data.records]
+
+    return replace(seen, sounds=sounds if "audio" in modalities else None, asked=lambda: asked)
 
 
 def modalities_of(data: RecordSet) -> list[str]:
-    """Modalities beside touch that every record has."""
-    return [name for name in ("image", "audio", "text") if all(has(r, name) for r in data.records)]
+    """Modalities other than touch that every record has."""
+    return [name for name in ("image", "audio", "text") if all(has(record, name) for record in data.records)]
 
 
 def parts_of(data: RecordSet) -> dict[str, RecordSet]:
@@ -88,7 +98,9 @@ def tenth_of_each_material(data: RecordSet) -> RecordSet:
     materials: dict[int | None, list[Record]] = {}
     for record in sorted(data.records, key=lambda record: sha256(record.id.encode()).digest()):
         materials.setdefault(record.labels.get("material"), []).append(record)
-    chosen = [record for records in materials.values() for record in records[: max(round(len(records) / 10), 1)]]
+    chosen = list[Record]()
+    for records in materials.values():
+        chosen += records[: max(round(len(records) / 10), 1)]
     return replace(data, records=tuple(chosen), chosen="val, a tenth of train")
 
 
@@ -98,6 +110,7 @@ Sets = Iterator[tuple[str, int, Splits]]
 
 def of_world(
     cache: Path,
+    model: UniTouchModel,
     processor: UniTouchProcessor,
     sensors: Sequence[str],
     seeds: Sequence[int],
@@ -113,14 +126,33 @@ def of_world(
     """
     for seed, sensor in product(seeds, (*sensors, None)):
         source = DrawnContacts(
-            0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects, scanned=scanned, recordings=recordings
+            number=0,
+            sensor=sensor,
+            objects=OBJECTS,
+            contacts_per_object=CONTACTS,
+            seed=FIRST_SEED + seed,
+            held_out=objects,
+            scanned=scanned,
+            recordings=recordings,
         )
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
-        yield sensor or "sensors drawn anew", source.seed, splits
+        embed_all(model, processor, splits)
+        name = sensor or "sensors drawn anew"
+        known = sensor in model.config.sensors
+        yield name, known, source.seed, splits
 
 
 def of_datasets(cache: Path, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
     """Data sets, each in all of its splits."""
     for data in sets:
         splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
-        yield data.name, 0, splits
+        embed_all(model, processor, splits)
+        known = {record.sensor for record in data.records} <= {*model.config.sensors}
+        yield data.name, known, 0, splits
+
+
+def embed_all(model: UniTouchModel, processor: UniTouchProcessor, splits: Splits) -> None:
+    """Gives contacts their features."""
+    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
+    for contacts in splits.values():
+        contacts.features = embed(model, processor, contacts, classifier)

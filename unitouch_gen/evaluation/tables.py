@@ -23,8 +23,14 @@ PROBED = {  # rows of linear probes, by features
 }
 ASKED = {"touch": "touch encoder, zero-shot", "image": "picture of the contact, zero-shot"}  # rows, by features
 GRASP_PROMPTS = {"dropped": "the object is falling on the ground", "lifted": "the object is lifted in the air"}  # 4.2
-TEMPLATES = ("this is an image of {}", "this is a touch image of {}", "this looks like {}", "this feels like {}",
-             "image of {}", "touch of {}")  # fmt: skip
+TEMPLATES = (
+    "this is an image of {}",
+    "this is a touch image of {}",
+    "this looks like {}",
+    "this feels like {}",
+    "image of {}",
+    "touch of {}",
+)
 """The prompts of Table 7."""
 
 
@@ -54,8 +60,11 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
     The class mean knows each contact's material alone. CCA and PLSCA are fitted to plain statistics of touches, or the
     touch encoder's embeddings, and the embeddings of the other modality.
     """
-    train, test, figures = splits["train"].features, splits["test"], dict[str, Figures]()
-    touch, material = test.features["touch"], test.material
+    train = splits["train"].features
+    test = splits["test"]
+    figures = dict[str, Figures]()
+    touch = test.features["touch"]
+    material = test.material
     for modality in [name for name in ("image", "audio", "text") if name in test.features]:
         gallery = test.features[modality]
         pairs = {"chance (another contact's touch)": (touch[others(len(touch))], gallery)}
@@ -63,8 +72,10 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
             pairs["class mean"] = (class_means(touch, material), gallery)
         for method in metrics.CORRELATED:
             for name, what in (("statistics", "plain statistics"), ("touch", "touch encoder")):
-                fitted = metrics.correlated(method, (train[name], train[modality]), test.features[name], gallery)
-                pairs[f"{method} of {what}, supervised"] = fitted
+                known = (train[name], train[modality])
+                pairs[f"{method} of {what}, supervised"] = metrics.correlated(
+                    method, known, test.features[name], gallery
+                )
         pairs["touch encoder"] = (touch, gallery)
         for row, (queries, found_in) in pairs.items():
             figures.setdefault(row, {})[modality] = metrics.mean_average_precision(queries, found_in, test.objects)
@@ -74,26 +85,30 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
 def _classified(
     splits: Splits, label: str, prompt: Callable[[str], str], embed: Embed, *, balanced: bool = False
 ) -> Figures:
-    train, fitted = _labelled(splits["train"], label)
-    val, chosen = _labelled(splits["val"], label)
-    test, known = _labelled(splits["test"], label)
+    """Shares of a label's classes that are named right, by row."""
+    (train, fitted), (val, chosen), (test, known) = (_labelled(splits[split], label) for split in SPLITS)
     classes = embed([prompt(name) for name in splits["test"].classes[label]])
     predicted = {"majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
-    for name in [name for name in PROBED if name in test]:
-        split = (train[name], fitted, val[name], chosen, test[name])
-        predicted[PROBED[name]] = metrics.linear_probe(*split, balanced=balanced)
-    predicted |= {row: _nearest(test[name], classes, known) for name, row in ASKED.items() if name in test}
+    for name, row in PROBED.items():
+        if name in test:
+            predicted[row] = metrics.linear_probe(train[name], fitted, val[name], chosen, test[name], balanced=balanced)
+    for name, row in ASKED.items():
+        if name in test:
+            predicted[row] = _nearest(test[name], classes, known)
     shares = {row: metrics.share_right(found, known, balanced=balanced) for row, found in predicted.items()}
     return {"chance": 1 / len(known.unique()), **shares}
 
 
 def _labelled(contacts: EvaluatedContacts, label: str) -> tuple[dict[str, Tensor], Tensor]:
     """Features of the contacts whose label is known, and the labels."""
-    rows = contacts.labels[label] >= 0
-    return {name: values[rows] for name, values in contacts.features.items()}, contacts.labels[label][rows]
+    labels = contacts.labels[label]
+    rows = labels >= 0
+    features = {name: values[rows] for name, values in contacts.features.items()}
+    return features, labels[rows]
 
 
 def _nearest(features: Tensor, classes: Tensor, known: Tensor) -> Tensor:
     """The class (N,) whose text is nearest, among those that occur in the labels `known`."""
     asked = known.unique()
-    return asked[metrics.cosines(features, classes[asked]).argmax(dim=1)]
+    nearest = metrics.cosines(features, classes[asked]).argmax(dim=1)
+    return asked[nearest]

@@ -20,7 +20,8 @@ from unitouch_gen.training.data import Contacts, DataConfig, columns_of, compute
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Twenty touches with pictures, captions and sounds, of five objects; noise, so that every one is its own."""
-    rng, rows = np.random.default_rng(0), ["touch,picture,sound,sensor,material,object,caption"]
+    rng = np.random.default_rng(0)
+    rows = ["touch,picture,sound,sensor,material,object,caption"]
     place = tmp_path / "mine"
     place.mkdir()
     for number in range(20):
@@ -29,7 +30,8 @@ def folder(tmp_path: Path) -> Path:
             Image.fromarray(pixels).save(place / f"{name}{number}.png")
         tone = np.sin(np.arange(4000) * (0.05 + 0.02 * number)).astype(np.float32)
         soundfile.write(place / f"{number}.wav", tone, 16000)
-        material, sensor = ("wood", "glass", "cork")[number % 3], "digit" if number < 15 else "gelsight"
+        material = ("wood", "glass", "cork")[number % 3]
+        sensor = "digit" if number < 15 else "gelsight"
         rows.append(f"touch{number}.png,picture{number}.png,{number}.wav,{sensor},{material},o{number % 5},n{number}")
     (place / "labels.csv").write_text("\n".join(rows))
     return place
@@ -45,13 +47,16 @@ def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp
     written = columns(folder, tmp_path / "cache", processor, *needs, touch_size=24)
     files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")}
     cached = columns(folder, tmp_path / "cache", processor, *needs, touch_size=24)
-    assert len(files) == 6 and {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")} == files
+    assert len(files) == 6
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("values.npy")} == files
     for one, other in zip(written, cached, strict=True):
-        assert isinstance(other.touch, np.memmap) and one.fingerprint == other.fingerprint
+        assert isinstance(other.touch, np.memmap)
+        assert one.fingerprint == other.fingerprint
         for name in ("image", "touch", "audio"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert [({*split.sensors}, len(split)) for split in cached] == [({"digit"}, 15), ({"gelsight"}, 5)]
-    smaller, split = UniTouchProcessor(image_size=24), cached[1]
+    smaller = UniTouchProcessor(image_size=24)
+    split = cached[1]
     for row, number in enumerate(range(15, 20)):
         image = processor.raw_images(str(folder / f"picture{number}.png"))[0].numpy()
         touch = smaller.raw_images(str(folder / f"touch{number}.png"))[0].numpy()
@@ -74,7 +79,8 @@ def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, 
 
 
 def test_what_is_in_the_cache_is_not_computed_again(tmp_path: Path) -> None:
-    values, file = torch.rand(7, 3), tmp_path / "cache" / "values.safetensors"
+    values = torch.rand(7, 3)
+    file = tmp_path / "cache" / "values.safetensors"
     assert torch.equal(computed_once(file, lambda: values), values)
     assert torch.equal(computed_once(file, pytest.fail), values)
 
@@ -117,9 +123,14 @@ def test_splits_by_objects_are_disjoint_whole_and_do_not_depend_on_the_order(cou
 
 
 def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path, joint: str) -> None:
-    settings = ["trainer.steps=2", "trainer.batch_size=4", "trainer.warmup=1", "trainer.mixed_precision=no",
-                f"data.sets=[{{path: {folder}, split: object}}]",
-                *(f"objective.{name}=0" for name in ("touch", "attributes", "maps"))]  # fmt: skip
+    settings = [
+        "trainer.steps=2",
+        "trainer.batch_size=4",
+        "trainer.warmup=1",
+        "trainer.mixed_precision=no",
+        f"data.sets=[{{path: {folder}, split: object}}]",
+        *(f"objective.{name}=0" for name in ("touch", "attributes", "maps")),
+    ]
     words = ["touch", "--output", str(tmp_path / "touch"), "--cache", str(tmp_path / "cache"), "--joint", joint]
     run_commands(app, "unitouch_gen.training", [*words, *(part for one in settings for part in ("--set", one))])
     sets = json.loads((tmp_path / "touch" / "record.json").read_text())["sets"]
@@ -160,7 +171,9 @@ def test_a_run_goes_on_with_other_data_only_if_that_is_asked_for(folder, tmp_pat
     with pytest.raises(SystemExit, match="2"):
         run("--resume")
     said = capsys.readouterr().err
-    assert '"records": 5, ' in said and '"records": 4, ' in said
+    assert '"records": 5, ' in said
+    assert '"records": 4, ' in said
     run("--resume", "--set", data, "--set", "trainer.steps=2")
     record = json.loads((tmp_path / "vae" / "record.json").read_text())
-    assert record["earlier_sets"] == [before] and record["sets"] != before
+    assert record["earlier_sets"] == [before]
+    assert record["sets"] != before

@@ -29,7 +29,8 @@ def splits(place: Path, _processor: UniTouchProcessor) -> list[Contacts]:
 def test_what_is_rendered_is_the_worlds(splits: list[Contacts], processor: UniTouchProcessor) -> None:
     assert [source.name for source in SOURCES] == ["drawn-any", "drawn-digit"]
     for split, source in zip(splits, SOURCES, strict=True):
-        names, pair = source.contacts("train"), source.pair("train", 0)
+        names = source.contacts("train")
+        pair = source.pair("train", 0)
         modalities = ("touch", "depth", "audio", "attributes", "image", "text")
         few = [part[:GROUP] for part in names]
         scene = World(source.seed, image_size=32).render(*few, modalities=modalities, sensors=pair)
@@ -55,7 +56,8 @@ def test_every_contact_has_captions_of_its_own(splits: list[Contacts]) -> None:
 
 
 def test_no_two_splits_or_sources_share_an_object_or_a_drawn_sensor() -> None:
-    objects, drawn = [], []
+    objects = []
+    drawn = []
     for source in DrawnConfig(sensors=[None, "digit", "gelsight"], objects=500).sources():
         for split in ("train", "val", "test"):
             material, object_, _ = source.contacts(split)
@@ -72,7 +74,8 @@ def test_no_two_splits_or_sources_share_an_object_or_a_drawn_sensor() -> None:
 def test_a_fingerprint_is_of_one_world_and_names_its_cache() -> None:
     first, second = SOURCES
     prints = [source.fingerprint("train") for source in (first, second, replace(first, seed=1), first)]
-    assert len({*prints, first.fingerprint("val")}) == 4 and prints[0] == prints[-1]
+    assert len({*prints, first.fingerprint("val")}) == 4
+    assert prints[0] == prints[-1]
 
 
 def test_what_is_cached_is_mapped_and_the_same(splits, place, processor, tmp_path: Path) -> None:
@@ -80,7 +83,8 @@ def test_what_is_cached_is_mapped_and_the_same(splits, place, processor, tmp_pat
     [again] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     assert {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")} == files
     [fresh] = columns_of(SOURCES[:1], tmp_path, CONFIG, processor, ())
-    assert again.text == fresh.text == splits[0].text and again.fingerprint == fresh.fingerprint
+    assert again.text == fresh.text == splits[0].text
+    assert again.fingerprint == fresh.fingerprint
     for name in ("image", "touch", "second", "audio", "attributes", "maps"):
         assert name == "attributes" or isinstance(getattr(again, name), np.memmap)
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
@@ -90,7 +94,8 @@ def test_other_sizes_and_sounds_are_rendered_anew(splits, place: Path, processor
     processor.image_size = 16
     [small] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     assert small.touch.shape[-1] == 16
-    before, processor.image_size = processor.audio, 32
+    before = processor.audio
+    processor.image_size = 32
     processor.audio = replace(before, mean=before.mean + 1.0)
     [heard] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     np.testing.assert_allclose(heard.audio, splits[0].audio - 1.0 / before.std, atol=1e-2)
@@ -103,12 +108,16 @@ def test_scanned_objects_are_those_of_their_split_and_named(place: Path, process
     [seen] = columns_of([source], place, config, processor, ("image", "touch"))
     names = source.contacts("train")
     scene = World(0, image_size=32, scanned=0.5).render(*(part[:GROUP] for part in names), modalities=("image", "text"))
-    assert seen.text[:GROUP] == scene.text and source.surfaces("train")[:GROUP] == scene.surface
+    assert seen.text[:GROUP] == scene.text
+    assert source.surfaces("train")[:GROUP] == scene.surface
     np.testing.assert_allclose(seen.image[:GROUP] / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
     assert 5 < sum(name is not None for name in source.surfaces("train")) <= 17
     every = replace(source, scanned=1.0, held_out=4)
-    held_out, shown = every.contacts("test"), every.surfaces("test")
-    assert None not in shown and len(shown) == 15 * 4 * 5 and not {*shown} & {*source.surfaces("train")}
+    held_out = every.contacts("test")
+    shown = every.surfaces("test")
+    assert None not in shown
+    assert len(shown) == 15 * 4 * 5
+    assert not {*shown} & {*source.surfaces("train")}
     assert len({*held_out[0].tolist()}) == 15
     prints = [
         replace(source, **changes).fingerprint("test") for changes in ({}, {"scanned": 0.0}, {"photographic": 1.0})

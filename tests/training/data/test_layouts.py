@@ -50,60 +50,96 @@ def told(data: RecordSet) -> list[str]:
 
 
 LAYOUTS: dict[Callable, tuple[int, str]] = {
-    touch_and_go: (3, f"""
+    touch_and_go: (
+        3,
+        f"""
         {ONE}/0000000000.jpg 0 40 - gelsight - {ONE} train material=wood soft=hard rough=rough
         {TWO}/0000000002.jpg 12 42 - gelsight - {TWO} test material=leather soft=soft
-        {THREE}/0000000001.jpg 21 41 - gelsight - {THREE} - material=others soft=hard"""),
-    feeling_of_success: (24, """
+        {THREE}/0000000001.jpg 21 41 - gelsight - {THREE} - material=others soft=hard""",
+    ),
+    feeling_of_success: (
+        24,
+        """
         000/i2/A 2 42 60 gelsight object_2 000/i2 - grasp=lifted
         000/i2/B 22 42 60 gelsight object_2 000/i2 - grasp=lifted
         000/i9/A 9 49 60 gelsight object_9 000/i9 - grasp=dropped
         000/i10/A 10 50 60 gelsight object_10 000/i10 - grasp=lifted
-        001/i0/B 32 52 60 gelsight object_12 001/i0 - grasp=lifted"""),
-    ycb_slide: (5, """
+        001/i0/B 32 52 60 gelsight object_12 001/i0 - grasp=lifted""",
+    ),
+    ycb_slide: (
+        5,
+        """
         digit/004_box/dataset_1/frame_0.jpg 20 - - digit 004_box digit/004_box/dataset_1 - material=box
         digit/004_box/dataset_1/frame_1.jpg 21 - - digit 004_box digit/004_box/dataset_1 - material=box
         digit/035_drill/dataset_0/frame_7.jpg 1 2 - digit 035_drill digit/035_drill/dataset_0 - material=drill
         tacto/004_box/00/2.jpg 2 - - tacto 004_box tacto/004_box/00 - material=box
-        tacto/004_box/00/10.jpg 10 - - tacto 004_box tacto/004_box/00 - material=box"""),
-    object_folder: (2, """
+        tacto/004_box/00/10.jpg 10 - - tacto 004_box tacto/004_box/00 - material=box""",
+    ),
+    object_folder: (
+        2,
+        """
         7/0 0 10 - tacto 7 - train material=0
-        101/1 3 13 - taxim 101 - test material=6"""),
-    object_folder_real: (3, """
+        101/1 3 13 - taxim 101 - test material=6""",
+    ),
+    object_folder_real: (
+        3,
+        """
         1/3/2 2 - - gelslim 1 1/3 - material=wood
         1/3/10 10 - - gelslim 1 1/3 - material=wood
-        2/3/0 0 - - gelslim 2 2/3 -"""),
-    ssvtp: (3, """
+        2/3/0 0 - - gelslim 2 2/3 -""",
+    ),
+    ssvtp: (
+        3,
+        """
         1 1 11 - digit - - train
         2 2 12 - digit - - -
-        30 30 40 - digit - - test"""),
-    hct: (6, """
+        30 30 40 - digit - - test""",
+    ),
+    hct: (
+        6,
+        """
         data1/one/tactile/0-0.5.jpg 1 63 0 digit - data1/one train
         data1/one/tactile/1-0.5.jpg 2 62 0 digit - data1/one train
-        data1/two/tactile/2-0.5.jpg 1 61 0 digit - data1/two train"""),
-    tacquad: (5, """
+        data1/two/tactile/2-0.5.jpg 1 61 0 digit - data1/two train""",
+    ),
+    tacquad: (
+        5,
+        """
         data_indoor/mug/gelsight/10 10 25 0 gelsight_mini mug data_indoor/mug/gelsight -
         data_indoor/mug/gelsight/11 11 25 0 gelsight_mini mug data_indoor/mug/gelsight -
         data_indoor/mug/digit/1 1 22 - digit mug data_indoor/mug/digit -
-        data_indoor/mug/duragel/3 3 - 0 duragel mug data_indoor/mug/duragel -"""),
-    table: (3, """
+        data_indoor/mug/duragel/3 3 - 0 duragel mug data_indoor/mug/duragel -""",
+    ),
+    table: (
+        3,
+        """
         a.png 0 1 2 digit one - train material=wood hardness=2
         b.png 1 - 2 gelsight two - test material=glass
-        c.png 2 1 - digit three - train hardness=10"""),
-    tree: (3, """
+        c.png 2 1 - digit three - train hardness=10""",
+    ),
+    tree: (
+        3,
+        """
         11.png 11 - - - - - -
         wood/2.png 2 20 41 - - - - material=wood
-        wood/10.png 10 30 40 - - - - material=wood"""),
-    tree_of_splits: (3, """
+        wood/10.png 10 30 40 - - - - material=wood""",
+    ),
+    tree_of_splits: (
+        3,
+        """
         train/glass/1.PNG 1 - - - - - train material=glass
         train/wood/1.png 0 - - - - - train material=wood
-        test/wood/1.png 2 - - - - - test material=wood"""),
-    tree_of_objects: (4, """
+        test/wood/1.png 2 - - - - - test material=wood""",
+    ),
+    tree_of_objects: (
+        4,
+        """
         Train/wood/2.png 2 - - - - - train material=wood
         Train/wood/plank/1.png 1 - - - wood/plank - train material=wood
         VALID/glass/jar/3.png 3 - - - glass/jar - val material=glass
-        test/glass/4.png 4 - - - - - test material=glass"""),
-}  # fmt: skip
+        test/glass/4.png 4 - - - - - test material=glass""",
+    ),
+}
 
 
 @pytest.mark.parametrize("make", LAYOUTS, ids=lambda make: make.__name__)
@@ -113,7 +149,8 @@ def test_a_layout_is_recognised_and_read(make: Callable, tmp_path: Path) -> None
     assert data.kind == (make.__name__ if make not in (table, tree, tree_of_splits, tree_of_objects) else "folder")
     count, lines = LAYOUTS[make]
     expected = [line.strip() for line in lines.strip().splitlines()]
-    assert len(data) == count and [line for line in told(data) if line in expected] == expected
+    assert len(data) == count
+    assert [line for line in told(data) if line in expected] == expected
     captions = {table: "rough, and hard", ssvtp: "smooth, number 1", hct: "soft, 0"}
     assert data.records[0].caption == captions.get(make)
 
@@ -147,6 +184,7 @@ def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
     object_folder(tmp_path)
     names = ["wood", "steel", "polycarbonate", "plastic", "iron", "ceramic", "glass"]
     data = open_dataset(tmp_path, sensor="mine", materials=names)
-    assert data.classes["material"] == tuple(names) and {record.sensor for record in data.records} == {"mine"}
+    assert data.classes["material"] == tuple(names)
+    assert {record.sensor for record in data.records} == {"mine"}
     (tmp_path / "split.json").unlink()
     assert len(open_dataset(tmp_path)) == 4  # without a split all points are there
