@@ -1,13 +1,16 @@
 """The README and the pages of docs/ name files and commands that exist, and their snippets run."""
 
 import re
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
 
 from tests.helpers.processes import Child, finished, script
 from unitouch_gen.solvers import SOLVERS
+from unitouch_gen.training import data
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 README = CHECKOUT / "README.md"
@@ -45,8 +48,8 @@ def test_each_solver_has_a_row_and_is_in_the_reference():
 
 def test_each_layout_of_data_sets_has_a_row():
     rows = re.findall(r"^\| `(\w+)` \|", (CHECKOUT / "docs" / "training.md").read_text(), re.M)
-    modules = (CHECKOUT / "training" / "data").glob("*.py")
-    layouts = {file.stem for file in modules if re.search("^LOOKS_LIKE", file.read_text(), re.M)}
+    names = [module.name for module in iter_modules(data.__path__)]
+    layouts = {name for name in names if hasattr(import_module(f"{data.__name__}.{name}"), "LOOKS_LIKE")}
     assert layouts
     assert layouts <= set(rows)
 

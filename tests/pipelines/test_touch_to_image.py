@@ -9,8 +9,9 @@ from torch.testing import assert_close
 from tests.helpers.calls import Call, quiet, seeded, watched
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import UnfamiliarInputWarning
-from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.joint import Gaussians, RelativeDistance, touch_statistics
 from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.training.touch import fit_gaussians
 
 NORM = 3.0  # `embedding_norm` of the joint space
 
@@ -67,21 +68,36 @@ def test_a_background_takes_the_look_of_its_sensor_away(pipe, touch):
 
 
 @pytest.mark.parametrize(("fixture", "encode"), [("pipe", "encode_touch"), ("x_to_touch", "encode_condition")])
-def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode, monkeypatch):
+def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode):
+    """Of a joint space that knows what is like the second touch alone."""
     pipe = request.getfixturevalue(fixture)
-    reasons = ["unlike anything known", None]
-    features = UniTouchModel.get_touch_features
-    monkeypatch.setattr(UniTouchModel, "encode_touches", lambda self, *given: (features(self, *given), reasons))
+    distance = distance_between(pipe, known=touch[1:], foreign=touch[:1])
+    pipe.unitouch.out_of_distribution["touch"] = distance
+    pipe.unitouch.config.ood_thresholds = {"touch": {"foreign": 0.0}}
     for call in (pipe, getattr(pipe, encode)):
         with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[0\]`: unlike anything known\. .* a guess") as caught:
             made = call(touch=touch)
         assert len(caught) == 1
         assert caught[0].filename == __file__
-        assert call is not pipe or (made.report.unknown == {"touch": reasons} and made.report.success)
-    reasons[0] = None
+        if call is pipe:
+            assert made.report.unknown == {"touch": ["unlike anything known", None]}
+            assert made.report.success
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfamiliarInputWarning)
-        assert pipe(touch=touch).report.unknown == {}
+        assert pipe(touch=touch[1:]).report.unknown == {}
+
+
+@torch.no_grad()
+def distance_between(pipe, known: torch.Tensor, foreign: torch.Tensor) -> RelativeDistance:
+    """What is positive for touches that are nearer to `foreign` than to `known` ones, under noise."""
+
+    def gaussians(touch: torch.Tensor) -> Gaussians:
+        noise = 0.01 * torch.randn(64, *touch.shape[1:], generator=seeded())
+        pixels = pipe.processor.touch((touch + noise).clamp(0, 1))
+        statistics = touch_statistics(pipe.unitouch.touch_model.stem(pixels), pixels)
+        return fit_gaussians(statistics, torch.zeros(64, dtype=torch.int64))
+
+    return RelativeDistance(gaussians(known), gaussians(foreign))
 
 
 def test_the_noise_level_is_the_checkpoints_unless_a_call_says_another(draw, pipe):

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.helpers.chances import has_chance
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, World
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SHAPES
@@ -150,7 +151,7 @@ def test_drawn_objects_stay_as_they_are_beside_scanned_ones() -> None:
     plain = World(image_size=32).render(*names, **every)
     mixed = World(image_size=32, scanned=0.5).render(*names, **every)
     drawn = torch.tensor([name is None for name in mixed.surface])
-    assert 5 < drawn.sum() < 16
+    assert 0 < drawn.sum() < len(drawn)
     assert plain.surface == [None] * len(drawn)
     assert torch.equal(plain.image[drawn], mixed.image[drawn])
     assert torch.equal(plain.touch["digit"][drawn], mixed.touch["digit"][drawn])
@@ -210,7 +211,7 @@ def test_photos_are_of_the_same_contacts_under_a_light_of_their_own() -> None:
     worlds = [World(image_size=32, scanned=1.0, photographic=share) for share in (0.0, 0.5, 1.0, 1.0)]
     plain, some, photos, again = (world.render(*names, modalities=("image",)).image for world in worlds)
     changed = (some != plain).flatten(1).any(dim=1)
-    assert 3 < changed.sum() < 13
+    assert has_chance(changed.sum(), len(changed), 0.5)
     assert torch.equal(photos, again)
     assert (photos != plain).flatten(1).any(dim=1).all()
     assert photos.min() >= 0.0
