@@ -78,7 +78,7 @@ def test_a_message_says_what_came_and_what_is_wanted():
         check_refusal(partial(check_fields, SamplingArguments, **values), name, said, kind=error, given=values[name])
 
 
-def test_numbers_and_tensors():
+def test_numbers_and_tensors_out_of_bounds_are_refused():
     wide = torch.zeros(2, 3)
     of_shape = partial(errors.check_tensor, "x")
     for call, kind, *said in (
@@ -94,7 +94,7 @@ def test_numbers_and_tensors():
         check_refusal(call, "x", *said, kind=kind)
 
 
-def test_extras_that_are_missing_or_cannot_be_imported(tmp_path, monkeypatch):
+def test_extras_that_are_missing_or_cannot_be_imported_are_named(tmp_path, monkeypatch):
     (tmp_path / "broken_extra.py").write_text("raise ImportError('Using SOCKS proxy, without its package.')")
     monkeypatch.syspath_prepend(tmp_path)
     missing = r'is missing: pip install "unitouch_gen\[train\]"'
@@ -153,7 +153,7 @@ NO_IMAGES = (
 )
 
 
-def test_images():
+def test_images_that_cannot_be_used_are_refused():
     check(lambda touch: load_images("touch", touch), IMAGES)
     for value in NO_IMAGES:
         check_refusal(partial(load_images, "touch", value), "touch", " is", kind=InvalidTypeError)
@@ -175,13 +175,13 @@ SOUNDS: list[Row] = [
 ]
 
 
-def test_sounds():
+def test_sounds_that_cannot_be_used_are_refused():
     for given, said in SOUNDS:
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"^`audio.*{said}"):
             load_sounds("audio", given["audio"])
 
 
-def test_recordings_that_show_no_contact():
+def test_recordings_that_show_no_contact_are_refused():
     rest = recordings.rest()
     rows: list[Row] = [
         ({"touch": iter([])}, "shows no contact"),
@@ -194,7 +194,7 @@ def test_recordings_that_show_no_contact():
     check(lambda touch: firmest("touch", touch), rows)
 
 
-def test_names_of_examples():
+def test_unknown_names_of_examples_are_refused():
     check_refusal(partial(example, "brik"), "name", "is 'brik'.*Did you mean 'brick'")
     check_refusal(partial(example, "brick", "smell"), "modality", "is 'smell'")
 
@@ -233,7 +233,7 @@ PARTS_OF_IT = [  # a part's settings, and what is named
 ]
 
 
-def test_sizes_of_networks():
+def test_sizes_that_no_network_can_have_are_refused():
     check(UniTouchViTConfig, TRANSFORMER)
     check(UniTouchConfig, JOINT_SPACE)
     for part, named in PARTS_OF_IT:
@@ -251,14 +251,14 @@ AUDIO = {"sampling_rate": 0, "clip_seconds": 0.0, "clips": 0, "frames": "204", "
 AUDIO |= {"frame_shift": 0.0, "mean": INF}
 
 
-def test_settings_of_a_processor():
+def test_settings_that_a_processor_cannot_have_are_refused():
     check(UniTouchProcessor, PROCESSOR)
     for name, value in (*AUDIO.items(), ("frames", 10**12)):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}` is "):
             UniTouchProcessor(audio={name: value})
 
 
-def test_tokenizers_that_are_missing_or_cannot_pad():
+def test_tokenizers_that_are_missing_or_cannot_pad_are_refused():
     """One without a length would ask for gigabytes."""
     for length in (10**9, 2):
         other = copy.deepcopy(clip_tokenizer())
@@ -268,14 +268,14 @@ def test_tokenizers_that_are_missing_or_cannot_pad():
     check_refusal(partial(UniTouchProcessor(image_size=32).text, "rough brick"), "text", "has no tokenizer")
 
 
-def test_sensors_of_a_bank():
+def test_sensors_that_a_bank_does_not_hold_are_refused():
     bank = SensorBank(("gelsight", "digit"), 5, 16, 8)
     check_refusal(partial(bank.match, torch.zeros(1, 3, 8, 8)), "sensor", "is None.*no prototypes.*gelsight")
     none = SensorBank((), 5, 16, 8)
     check_refusal(partial(none.match, torch.zeros(1, 3, 8, 8), "digit"), "sensor", "no sensor tokens")
 
 
-def test_language_models_that_do_not_fit_a_bridge():
+def test_language_models_that_do_not_fit_a_bridge_are_refused():
     def model_of(kind: str, **sizes: Any) -> Any:
         return AutoModelForCausalLM.from_config(AutoConfig.for_model(kind, **sizes)).eval()
 
@@ -293,7 +293,7 @@ def test_language_models_that_do_not_fit_a_bridge():
     check_refusal(gpt, "o_proj", "GPT2LMHeadModel, whose attention has no")
 
 
-def test_joint_spaces_that_texture_has_no_place_in():
+def test_joint_spaces_that_texture_has_no_place_in_are_refused():
     config = joint_config(clip_tokenizer())
     stemmed = {**config.vision_config.to_dict(), "stem": "residual", "texture_width": 8}
     textured = {**config.touch_config.to_dict(), "texture_width": 8}
@@ -313,7 +313,7 @@ CLASSIFIED: list[Row] = [
 ]
 
 
-def test_labels_and_templates_of_a_zero_shot_classifier():
+def test_labels_and_templates_that_cannot_be_classified_by_are_refused():
     parts = make_components()
     images = torch.rand(1, 3, 32, 32)
     classifier = ZeroShotTouchClassifier(parts["unitouch"], parts["processor"])
@@ -352,14 +352,14 @@ STEPS: list[Row] = [
 ]
 
 
-def test_steps_that_cannot_be_made():
+def test_steps_that_cannot_be_made_are_refused():
     def make(scheduler: Any, **arguments: Any) -> None:
         prepare_steps(scheduler, check_fields(SamplingArguments, **arguments))
 
     check(make, STEPS, scheduler=PROBLEMS["gaussian"].scheduler())
 
 
-def test_noise_levels_that_do_not_rise_in_float32_or_are_none():
+def test_noise_levels_that_do_not_rise_in_float32_are_refused():
     settings = ({"beta_start": 1e-8}, {"beta_end": 0.999}, {"num_train_timesteps": 1, "trained_betas": [0.9]})
     for scheduler in (*(diffusers.DDIMScheduler(**one) for one in settings), FLOW):
         check_refusal(partial(NoiseSchedule.of, scheduler), "scheduler", "is .*noise levels")
@@ -410,7 +410,7 @@ PRESSES: list[Row] = [
 ]
 
 
-def test_height_maps_and_how_they_are_pressed():
+def test_height_maps_that_cannot_be_pressed_are_refused():
     check(press, MAPS)
     check(press, PRESSES, height=BALL)
 
@@ -427,13 +427,13 @@ SCENES: list[Row] = [
 ]
 
 
-def test_worlds_and_what_is_asked_of_them():
+def test_scenes_that_a_world_cannot_render_are_refused():
     check(World, [*each("seed", -1, 1.5, True, "0"), *each("image_size", 0, 64.0, "64", 10**9)])
     render = World(image_size=32).render
     check(render, SCENES, material=[1], object=[1], contact=[1])
 
 
-def test_sensors_that_are_drawn_or_untouched():
+def test_sensors_that_cannot_be_drawn_are_refused():
     for named, call in (
         ("seed", partial(draw_sensor, -1, 0)),
         ("number", partial(draw_sensor, 0, 1.5)),
@@ -447,7 +447,7 @@ def test_sensors_that_are_drawn_or_untouched():
 # Data sets ------------------------------------------------------------------------------------------------------------
 
 
-def test_arguments_of_a_data_set(tmp_path, monkeypatch):
+def test_arguments_that_open_no_data_set_are_refused(tmp_path, monkeypatch):
     table(tmp_path)
     for name in ("images_tac/image_1_tac.jpg", "label.json"):
         (tmp_path / "two" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -463,7 +463,7 @@ def test_arguments_of_a_data_set(tmp_path, monkeypatch):
     check(open_dataset, rows, path=tmp_path)
 
 
-def test_contacts_to_draw(tmp_path):
+def test_contacts_that_cannot_be_drawn_are_refused(tmp_path):
     def columns(needs: tuple[str, ...], size: int | None = None, **drawn: Any) -> None:
         config = DataConfig(drawn=DrawnConfig(objects=1, contacts_per_object=1, **drawn), touch_size=size)
         columns_of(config.sources(), tmp_path, config, UniTouchProcessor(image_size=32), needs)

@@ -80,14 +80,14 @@ IMAGES = [
 
 
 @pytest.mark.parametrize(("name", "content", "said"), [pytest.param(*row, id=row[0]) for row in IMAGES])
-def test_files_that_are_no_images(tmp_path, monkeypatch, name, content, said):
+def test_files_that_are_no_images_are_refused(tmp_path, monkeypatch, name, content, said):
     """By a path that begins with `~`, the home folder."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / name).write_bytes(content)
     check_refusal(partial(load_images, "touch", f"~/{name}"), "touch", said)
 
 
-def test_deep_tiffs_that_pillow_misreads(tmp_path):
+def test_deep_tiffs_that_pillow_misreads_are_refused(tmp_path):
     """One of planes, and one whose zero is white, by the tags of TIFF 6.0."""
     for tag, value in ((284, 2), (262, 0)):
         Image.fromarray(np.zeros((32, 32), np.uint16)).save(tmp_path / "deep.tif", tiffinfo={tag: value})
@@ -96,13 +96,13 @@ def test_deep_tiffs_that_pillow_misreads(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"not a sound", b"RIFF\0\0\0\0WAVE", encoded(PICTURE)])
-def test_files_that_are_no_sounds(tmp_path, content):
+def test_files_that_are_no_sounds_are_refused(tmp_path, content):
     (tmp_path / "hit.wav").write_bytes(content)
     read = partial(load_sounds, "audio", tmp_path / "hit.wav")
     check_refusal(read, "audio", r"names .*hit\.wav.*cannot be read as a sound \(")
 
 
-def test_files_that_are_no_height_maps(tmp_path):
+def test_files_that_are_no_height_maps_are_refused(tmp_path):
     (tmp_path / "words.png").write_text("no picture")
     (tmp_path / "map.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(64))
     np.save(tmp_path / "objects.npy", np.array([{}]), allow_pickle=True)
@@ -126,12 +126,12 @@ def test_files_that_are_no_height_maps(tmp_path):
         ("k\xe4fer\n1".encode("cp1252"), "save it as UTF-8"),
     ],
 )
-def test_files_that_are_no_tables(tmp_path, content, said):
+def test_files_that_are_no_tables_are_refused(tmp_path, content, said):
     (tmp_path / "list.csv").write_bytes(content)
     check_refusal(partial(read_table, tmp_path / "list.csv"), None, "list.csv", said)
 
 
-def test_git_lfs_pointers(tmp_path):
+def test_git_lfs_pointers_are_refused(tmp_path):
     """As `git clone` leaves one without Git LFS: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md"""
     digest = "4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393"
     pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{digest}\nsize 12345\n"
@@ -183,7 +183,7 @@ def copied(folder: Path, place: Path) -> Path:
     return Path(shutil.copytree(folder, place))
 
 
-def test_places_that_hold_no_model(joint):
+def test_places_that_hold_no_model_are_refused(joint):
     folder = joint("1GB")
     for place, said in {
         f"{folder}/nothing/here": "no folder",
@@ -223,7 +223,7 @@ def test_damaged_settings_are_named_by_their_place(joint, tmp_path, damage):
         check_refusal(partial(kind.from_pretrained, folder), PLACE, re.escape(str(folder)))
 
 
-def test_an_index_that_leads_out_of_its_folder(joint, tmp_path):
+def test_an_index_that_leads_out_of_its_folder_is_refused(joint, tmp_path):
     folder = copied(joint("20KB"), tmp_path / "model")
     index = folder / "model.safetensors.index.json"
     next(folder.glob("model-*.safetensors")).rename(tmp_path / "outside.safetensors")
@@ -233,7 +233,7 @@ def test_an_index_that_leads_out_of_its_folder(joint, tmp_path):
         read_touch(folder)
 
 
-def test_stored_settings_that_nothing_can_be_built_from(joint, tmp_path):
+def test_stored_settings_that_nothing_can_be_built_from_are_refused(joint, tmp_path):
     for kind, file, changes, said in (
         (UniTouchViTConfig, "config", {"hidden_size": "wide"}, "hidden_size"),
         (UniTouchConfig, "config", {"sensor_tokens": 0}, "sensor_tokens"),
@@ -250,7 +250,7 @@ def test_stored_settings_that_nothing_can_be_built_from(joint, tmp_path):
             kind.from_pretrained(folder)
 
 
-def test_places_that_hold_no_processor(tmp_path):
+def test_places_that_hold_no_processor_are_refused(tmp_path):
     for place in (f"{tmp_path}/nothing", str(tmp_path), "user/no-such-processor", "spaces in it"):
         read = partial(UniTouchProcessor.from_pretrained, place, local_files_only=True)
         check_refusal(read, PLACE, f"is '{place}'")
@@ -259,7 +259,7 @@ def test_places_that_hold_no_processor(tmp_path):
 # Published files ------------------------------------------------------------------------------------------------------
 
 
-def test_published_files_that_are_exchanged_or_left_out(tmp_path):
+def test_published_files_that_are_exchanged_or_left_out_are_refused(tmp_path):
     files, _ = published(tmp_path, sizes())
     convert = partial(convert_published, tmp_path / "model")
     for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
@@ -283,7 +283,7 @@ NO_CHECKPOINT: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 @pytest.mark.parametrize("kind", NO_CHECKPOINT)
-def test_files_that_are_no_checkpoints(tmp_path, suffix, kind):
+def test_files_that_are_no_checkpoints_are_refused(tmp_path, suffix, kind):
     file = tmp_path / f"{kind}{suffix}"
     NO_CHECKPOINT[kind](file)
     said = f"names .*{kind}.*(be read|does not exist|no weights)"
@@ -300,7 +300,7 @@ def llama(tmp_path) -> tuple[Path, Path]:
     return folder, folder.with_suffix(".pth")
 
 
-def test_folders_without_a_llama_in_transformers_layout(llama, tmp_path):
+def test_folders_without_a_llama_in_transformers_layout_are_refused(llama, tmp_path):
     folder, bridge = llama
     (folder / "config.json").rename(folder / "params.json")
     for place in (folder, tmp_path):
@@ -308,7 +308,7 @@ def test_folders_without_a_llama_in_transformers_layout(llama, tmp_path):
         check_refusal(partial(read_touch_llm, bridge, place), "llama", said)
 
 
-def test_a_llama_that_is_not_whole(llama, tmp_path):
+def test_a_llama_that_is_not_whole_is_refused(llama, tmp_path):
     folder, bridge = llama
     read = partial(read_touch_llm, bridge, folder)
     (folder / "tokenizer.json").rename(tmp_path / "tokenizer.json")
@@ -341,7 +341,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("make", "damage", "said"), BROKEN)
-def test_data_sets_that_are_broken(tmp_path, make, damage, said):
+def test_data_sets_that_are_broken_are_refused(tmp_path, make, damage, said):
     make(tmp_path)
     write(tmp_path, damage)
     check_refusal(partial(open_dataset, tmp_path), "path", f"`path` is .*, read as .*{said}")

@@ -60,7 +60,7 @@ def test_the_bridge_is_the_formula_of_the_papers_release(neighbours, temperature
         torch.testing.assert_close(row, embed.norm() * moved / moved.norm())
 
 
-def test_what_is_in_the_bank_stays_where_it_is_and_so_does_zero():
+def test_the_bridge_leaves_stored_embeddings_and_zero_where_they_are():
     for embeds in (3.0 * BANK, torch.zeros(2, D)):
         found = bridge_nearest(embeds, BANK, neighbours=10, temperature=1e-3, share=1.0)
         torch.testing.assert_close(found, embeds, atol=1e-4, rtol=0.0)

@@ -159,7 +159,7 @@ def test_the_processor_of_the_folder_fits_its_model(model, folder):
 
 
 @pytest.mark.parametrize("there", ["a model", "a pipeline", "a file"])
-def test_what_else_is_there_is_not_written_over(files, folder, tmp_path, there):
+def test_convert_writes_over_nothing_that_is_there(files, folder, tmp_path, there):
     output = tmp_path / "model"
     if there == "a file":
         output.write_text("notes")

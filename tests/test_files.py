@@ -44,7 +44,7 @@ def test_files_below_are_listed_once_by_their_own_names_whatever_links_lead_back
     assert found == ["a/1.png", "a/2.png", "a/10.png", "b/c/3.png", "far/4.png"]
 
 
-def test_a_link_stays_one(tmp_path):
+def test_write_file_keeps_a_link(tmp_path):
     file = write_file("output", tmp_path / "a.txt", "old")
     (tmp_path / "link").symlink_to(file)
     write_file("output", tmp_path / "link", "new")
@@ -52,7 +52,7 @@ def test_a_link_stays_one(tmp_path):
     assert file.read_text() == "new"
 
 
-def test_what_cannot_be_written_names_its_argument_and_checking_leaves_nothing(tmp_path):
+def test_check_writable_names_its_argument_and_leaves_nothing(tmp_path):
     check_writable("output", tmp_path / "new" / "a.txt")
     assert not list(tmp_path.iterdir())
     (tmp_path / "folder").mkdir()

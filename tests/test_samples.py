@@ -29,7 +29,7 @@ NOT_RUN = {
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3])
-def test_no_word_covers_a_tile(blocks):
+def test_a_grid_covers_no_tile_with_words(blocks):
     labels = ["synthetic fabric", "woven natural fabric", "", "gjpqy", "glass"]
     titles = ["touch", "true picture", "an unusually long title of a column"]
     rows = [[torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1).expand(3, 4, 4)] * 3] * 5  # red
@@ -38,7 +38,7 @@ def test_no_word_covers_a_tile(blocks):
         assert (np.asarray(grid) == (255, 0, 0)).all(axis=2).sum() == 15 * side**2
 
 
-def test_a_tile_keeps_its_pixels():
+def test_a_grid_keeps_the_pixels_of_a_tile():
     pixels = torch.randint(0, 256, (3, 16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     grid = np.asarray(draw_grid([[pixels / 255]], labels=["a"], titles=["b"], side=64))
     expected = np.kron(pixels.permute(1, 2, 0).numpy(), np.ones((4, 4, 1), dtype=np.uint8))

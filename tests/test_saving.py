@@ -191,7 +191,7 @@ def test_a_reader_beside_a_save_reads_one_of_two_models(tmp_path):
     assert (tmp_path / "model" / "part" / "b.json").read_text() == "two"
 
 
-def test_of_two_saves_at_once_one_is_there(tmp_path):
+def test_one_of_two_saves_at_once_is_there(tmp_path):
     def fill_again(content: str) -> None:
         for _ in range(20):
             fill(tmp_path / "model", content)

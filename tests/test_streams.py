@@ -51,7 +51,7 @@ def run(folder: Path, redirections: str) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize("redirections", ["<&- >&- 2>&-", "| true", "2>&1 | head -n 1"])
-def test_nobody_has_to_read(tmp_path, redirections):
+def test_standard_output_that_is_closed_or_read_by_head_ends_no_command(tmp_path, redirections):
     done = run(tmp_path, redirections)
     assert done.returncode == 0, done.stderr[-300:]
     assert (tmp_path / "made").exists(), done.stderr[-300:]

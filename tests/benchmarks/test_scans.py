@@ -78,7 +78,7 @@ def test_controls_of_what_is_found_are_what_they_should_be() -> None:
     assert scans.found_row(gallery[:, others(43)], gallery, gallery)["class_mean"] == 1.0
 
 
-def test_a_linear_relation_is_read() -> None:
+def test_read_linearly_finds_a_linear_relation() -> None:
     mixing = random(12, 20, seed=1)
     source = random(300, 12, seed=2)
     known = source[:257]

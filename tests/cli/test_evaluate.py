@@ -51,7 +51,7 @@ def test_tables_of_a_data_set_stand_beside_their_controls(rows_of, models, pictu
 
 
 @pytest.mark.parametrize("table", ["touch-to-image", "x-to-touch"])
-def test_what_pipelines_make_stands_beside_its_controls(rows_of, models, pictured, table):
+def test_tables_of_pipelines_rank_real_images_first(rows_of, models, pictured, table):
     rows = rows_of(table, "--model", models[table], "--data", pictured, "--each", "2")
     distance = rows["distance, in domain" if table == "touch-to-image" else "picture: distance, in domain"]
     assert distance["ceiling"] < distance["value"]

@@ -22,7 +22,7 @@ def table(monkeypatch):
     return lambda *rows: monkeypatch.setattr(stability, "cases", lambda load, kinds: list(rows))
 
 
-def test_cases_are_run_by_name(command, table):
+def test_stability_runs_cases_by_name(command, table):
     table(FINE, FAR, RAISING)
     code, out, _ = command("stability", "--only", "fine")
     assert code == 0

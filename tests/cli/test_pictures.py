@@ -116,7 +116,7 @@ def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
         ("example:brick example:digit_wood", ["gelsight_brick", "digit_wood"]),
     ],
 )
-def test_words_stand_for_files(here, run, words, stems):
+def test_globs_folders_and_examples_stand_for_files(here, run, words, stems):
     for name in ("10.png", "9.PNG", "a[1].png"):
         shutil.copy("in/dark.png", f"in/{name}")
     for name in ("._a.png", "Thumbs.db", "notes.txt"):

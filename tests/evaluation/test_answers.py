@@ -54,7 +54,7 @@ class Knowing:
         return SimpleNamespace(texts=texts)
 
 
-def test_what_knows_a_contact_is_right_and_what_knows_another_is_not(contacts):
+def test_caption_table_tells_right_answers_from_those_of_another_contact(contacts):
     for one in contacts.asked():  # all are asked the same
         for topic, (_, answers) in one.items():
             one[topic] = (topic, answers)

@@ -89,7 +89,7 @@ def test_mean_average_precision_is_scikit_learns():
 
 
 @pytest.mark.parametrize(("method", "least"), [("CCA", 0.99), ("PLSCA", 0.4)])  # PLS is drawn to what varies most
-def test_what_two_views_share_is_found(method, least):
+def test_cca_and_plsca_find_what_two_views_share(method, least):
     shared = random(400, 4).double()
     one, other = (shared @ random(4, width, seed=width).double() for width in (12, 8))
     pairs = (one[:200], other[:200])

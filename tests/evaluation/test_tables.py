@@ -88,7 +88,7 @@ def sloping() -> ContactClassifier:
     return ContactClassifier(config).eval()
 
 
-def test_of_real_images_every_measure_is_its_best(splits):
+def test_measures_of_generated_images_are_best_for_real_ones(splits):
     judges = {"image": sloping(), "touch": sloping()}
     rows = torch.arange(0, COUNT, 5)
     real = torch.from_numpy(splits["test"].image[rows.numpy()]).float() / 255

@@ -52,7 +52,7 @@ def test_shares_are_a_softmax_at_the_temperature_of_training(template, classifie
         assert list(named.values()) == sorted(named.values(), reverse=True)
 
 
-def test_what_is_known_is_said_in_words():
+def test_named_prints_shares_or_that_a_touch_is_unknown():
     shares = {"brick": 0.8, "tile": 0.12}
     unlike = "unlike anything known"
     assert str(Named(shares, None)) == "brick 80%, tile 12%"
@@ -60,7 +60,7 @@ def test_what_is_known_is_said_in_words():
     assert str(Named(shares, "nothing is touched")) == "nothing is touched"
 
 
-def test_only_the_best_are_named(classifier, images):
+def test_top_keeps_the_best_labels(classifier, images):
     whole = classifier(images, NAMES, top=99)
     best = classifier(images, NAMES, top=2)
     assert [list(one.items())[:2] for one in whole] == [list(one.items()) for one in best]

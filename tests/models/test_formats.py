@@ -60,5 +60,5 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_kind_is_named(kind):
+def test_content_kind_names_the_format_of_a_file(kind):
     assert content_kind(KINDS[kind]).startswith(kind)

@@ -41,7 +41,7 @@ def generate(model, rows=slice(None), **options):
 
 
 @torch.no_grad()
-def test_what_is_added_is_the_gated_value_of_an_adapter_token(parts):
+def test_the_language_bridge_adds_the_gated_value_of_an_adapter_token(parts):
     """By an adapter key and value in the attention itself, whose softmax over one token is 1."""
     bridge, model = parts
     seen = {}

@@ -51,7 +51,7 @@ def reference(samples: np.ndarray, bins: int, number: int) -> list[float]:
 
 
 @pytest.mark.parametrize("bins", [128, 23])
-def test_frames_are_kaldis(bins: int) -> None:
+def test_log_mel_frames_are_kaldis(bins: int) -> None:
     time = np.arange(RATE) / RATE
     ring = sum(a * np.exp(-d * time) * np.sin(2 * np.pi * f * time) for a, f, d in ((0.4, 440, 6), (0.2, 1830, 15)))
     samples = (ring + 0.02 * np.sin(2 * np.pi * (100 + 1800 * time) * time)).astype(np.float32)

@@ -72,18 +72,7 @@ def test_texture_is_added_to_embeddings(tmp_path: Path) -> None:
     assert torch.equal(again.get_touch_features(pixels, ids), found[1])
 
 
-def test_only_changes_of_drawn_contacts_are_penalised() -> None:
-    weights = dict.fromkeys(("image", "touch", "text", "image_name", "touch_name", "drawn", "drawn_touch"), 1.0)
-    objective = TextureObjective(with_texture(), TextureLosses(**weights), torch.eye(3, 32))
-    embeds = torch.eye(4, 32)
-    batch = {"touch_embeds": embeds, "drawn": torch.tensor([1.0, 1.0, 0.0, 0.0])}
-    turned = torch.stack([embeds[0], embeds[0], -embeds[2], -embeds[3]])  # by 0, 90, 180 and 180 degrees
-    torch.testing.assert_close(objective.change(turned, batch, "touch"), torch.tensor(0.5))
-    batch["drawn"] = torch.zeros(4)
-    assert objective.change(turned, batch, "touch") == 0.0
-
-
-def test_a_trunk_learns_nothing() -> None:
+def test_the_trunk_of_texture_is_frozen() -> None:
     model = with_texture()
     for encoder in (model.vision_model, model.touch_model):
         assert not any(weight.requires_grad for weight in encoder.texture.trunk.parameters())

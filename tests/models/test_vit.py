@@ -177,7 +177,7 @@ def test_only_the_patches_and_their_mean_differ_from_transformers_own() -> None:
 
 
 @torch.no_grad()
-def test_it_is_saved_and_read_alone_and_in_a_joint_space(config: UniTouchConfig, tmp_path: Path) -> None:
+def test_a_stemmed_vision_model_is_saved_alone_and_in_a_joint_space(config: UniTouchConfig, tmp_path: Path) -> None:
     parts = {f"{name}_config": getattr(config, f"{name}_config") for name in ("text", "touch", "audio")}
     model = UniTouchModel(UniTouchConfig(vision_config={**SIZES, "stem": "residual"}, projection_dim=16, **parts))
     pixels = torch.randn(2, 3, 32, 32)

@@ -204,7 +204,7 @@ for each in (*solver_cases(), *network_cases(), *cases(tiny, KINDS)):
 @pytest.mark.parametrize(
     "group", [pytest.param(key, id=key[0], marks=pytest.mark.slow if key[1] else ()) for key in GROUPS]
 )
-def test_every_case_keeps_its_bound(group: tuple[str, bool]) -> None:
+def test_every_stability_case_keeps_its_bound(group: tuple[str, bool]) -> None:
     for case in GROUPS[group]:
         value, bound = case.run()
         assert value <= bound, f"{case.name}: {value:.2g} is above {bound:.2g} ({case.reason})"
@@ -215,7 +215,7 @@ def test_names_are_unique_and_no_pipeline_is_loaded_to_list_them() -> None:
     assert len({case.name for case in found}) == len(found)
 
 
-def test_what_is_not_finite_or_ends_otherwise_has_an_infinite_error() -> None:
+def test_stability_error_is_infinite_for_non_finite_results_and_other_codes() -> None:
     result = torch.tensor([[1.0, math.nan], [1.0, 1.0]])
     ones = torch.ones(2, 2)
     codes = [SUCCESS] * 2

@@ -42,7 +42,7 @@ def test_a_row_has_the_error_against_the_closed_form(solver):
         assert row["error"] == pytest.approx(relative_rms(latents, GAUSSIAN.truth).median().item(), rel=1e-5)
 
 
-def test_what_cannot_be_run_or_breaks_is_a_row_as_well():
+def test_work_precision_has_a_row_for_runs_that_fail():
     failed = measure(GAUSSIAN, "diffusers:ddim", 1000)  # leading spacing with an offset has no 1000 steps
     assert failed["failures"] == 3
     assert failed["reason"].startswith("InvalidInputError: `num_inference_steps` is 1000")

@@ -120,7 +120,7 @@ def draw(pipe, name, count=1, **options):
     return (call.one(0) if count == 1 else call)(**options)
 
 
-def test_it_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo, name):
+def test_turbo_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo, name):
     output = draw(turbo, name)
     assert (output.report.evaluations, output.report.guided) == (4, 0)
     assert "unconditional branch" in output.report.left_out
@@ -132,7 +132,7 @@ def test_it_draws_in_four_evaluations_of_one_branch_unless_told_otherwise(turbo,
     assert draw(turbo, name).report.evaluations == 4
 
 
-def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo, name, family):
+def test_turbo_is_the_pipeline_with_lora_weights_that_anybody_can_load(turbo, name, family):
     pipe = quiet(unitouch_gen.tiny(TURBO[name], family=family))
     pipe.scheduler = LCMScheduler.from_config(pipe.scheduler.config)
     plain = draw(pipe, name, timesteps=LEVELS, guidance_scale=1.0).images
@@ -142,7 +142,7 @@ def test_it_is_the_other_pipeline_with_weights_that_anybody_can_load(turbo, name
     assert not torch.allclose(expected, plain, atol=1e-2)
 
 
-def test_the_noise_of_each_step_is_of_each_pictures_own_generator(turbo, name):
+def test_turbo_draws_the_noise_of_each_step_from_each_pictures_own_generator(turbo, name):
     both = draw(turbo, name, 2, generator=[seeded(0), seeded(1)]).images
     assert_close(both[:1], draw(turbo, name, generator=seeded(0)).images, atol=1e-4, rtol=1e-3)
     noise = {"latents": torch.randn(1, *both.shape[1:])}

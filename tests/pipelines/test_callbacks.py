@@ -26,7 +26,7 @@ def states_of(call, **options) -> list[torch.Tensor]:
     return states
 
 
-def test_it_gets_what_was_asked_for_after_every_step(call):
+def test_a_callback_gets_the_tensors_asked_for_after_every_step(call):
     names = list(call.pipe._callback_tensor_inputs)
     calls = []
 
@@ -43,7 +43,7 @@ def test_it_gets_what_was_asked_for_after_every_step(call):
     assert len(steps) == report.steps > 0
 
 
-def test_other_latents_take_the_place_of_the_state(call):
+def test_latents_of_a_callback_replace_the_state(call):
     zeros = lambda pipe, step, timestep, tensors: {"latents": torch.zeros_like(tensors["latents"]).bfloat16()}  # noqa: E731
     found = call.latents(callback_on_step_end=zeros)
     assert found.dtype == torch.float32
@@ -56,7 +56,7 @@ STEPS = [{"num_inference_steps": 5}, {"num_inference_steps": 5, "solver": "unipc
 
 
 @pytest.mark.parametrize("steps", STEPS)
-def test_it_may_interrupt_its_own_call(call, steps):
+def test_a_callback_may_interrupt_its_own_call(call, steps):
     """Before the next evaluation, and without an error, whatever the other samples became."""
 
     def stop(pipe, step, timestep, tensors):
@@ -100,7 +100,7 @@ def test_a_callback_that_changes_nothing_changes_no_bit(call, steps):
     assert torch.equal(call.latents(callback_on_step_end=nothing, **steps), call.latents(**steps))
 
 
-def test_hidden_states_that_it_returns_count_from_then_on(call):
+def test_hidden_states_of_a_callback_count_from_then_on(call):
     name = call.pipe._callback_tensor_inputs[1]
     options = {"num_inference_steps": 3}
     other = torch.randn(4, 1 if name == "condition_embeds" else 12, 16, generator=seeded())
@@ -110,7 +110,7 @@ def test_hidden_states_that_it_returns_count_from_then_on(call):
     assert not torch.allclose(one, call.latents(**options), atol=1e-4)
 
 
-def test_a_new_scale_is_that_of_the_next_step_and_ends_with_its_call(call):
+def test_a_guidance_scale_of_a_callback_holds_from_the_next_step_to_the_end_of_its_call(call):
     options = {"num_inference_steps": 3, "solver": "ddim"}
     states = states_of(call, **options)
     expected = call.latents(**options)

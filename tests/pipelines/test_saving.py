@@ -152,7 +152,7 @@ def test_with_lora_loaded_nothing_is_saved_until_it_is_fused_or_unloaded(pipe, t
         load(tmp_path)
 
 
-def test_what_is_read_and_called_in_inference_mode_can_be_trained(family, touch):
+def test_a_pipeline_loaded_in_inference_mode_can_be_trained(family, touch):
     with torch.inference_mode():
         pipe = load(family, dtype=torch.bfloat16)
         Call(pipe, {"touch": touch}).latents()

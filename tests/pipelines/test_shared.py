@@ -145,7 +145,7 @@ def test_only_what_a_call_needs_runs_and_the_report_says_what_was_left_out(call)
     assert [name for name, _ in ran].count("prompt encoder") == ("prompt encoder" in needed)
 
 
-def test_leaving_out_changes_nothing(call):
+def test_what_a_call_leaves_out_changes_no_picture(call):
     """Without guidance, against a scale just above 1, which runs both branches; and embeddings, against inputs."""
     plain = call(guidance_scale=1.0, output_type="latent")
     assert_close(plain.images, call.latents(guidance_scale=1.0 + 1e-6), atol=1e-4, rtol=0)

@@ -77,7 +77,7 @@ def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
 
 
 @torch.no_grad()
-def test_ddim_by_hand(x_to_touch, inputs):
+def test_x_to_touch_is_ddim_written_by_hand(x_to_touch, inputs):
     """A plain transcription of guided DDIM with a zero token as the unconditional branch."""
     embeds = x_to_touch.encode_condition(text=inputs["text"])
     noise = torch.randn(1, 3, 8, 8, generator=seeded(3))

@@ -131,7 +131,7 @@ def test_sound_runs_are_a_success_and_too_few_steps_for_a_guidance_diverge(solve
 # The report -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
+def test_a_report_adds_up_the_seconds_of_a_stage_also_where_it_fails():
     report = RunReport()
     started = time.perf_counter()
     for _ in range(2):
@@ -141,7 +141,7 @@ def test_a_stage_adds_up_the_time_spent_inside_and_counts_where_it_fails():
     assert 0.02 <= report.seconds["touch"] <= time.perf_counter() - started
 
 
-def test_it_is_a_line_of_solver_counts_time_and_outcome_and_goes_through_json_as_a_copy():
+def test_a_report_is_one_line_and_goes_through_json_as_a_copy():
     report = RunReport(
         solver="unipc",
         steps=10,
@@ -164,5 +164,5 @@ def test_it_is_a_line_of_solver_counts_time_and_outcome_and_goes_through_json_as
     assert str(RunReport(codes=[SUCCESS])).endswith("0 evaluations, 0.00 s (); all finite")
 
 
-def test_every_code_has_a_message():
+def test_every_return_code_has_a_message():
     assert all(code.message.endswith(".") for code in ReturnCode)

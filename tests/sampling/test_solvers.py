@@ -43,7 +43,7 @@ def by_diffusers(scheduler, steps: int, start: torch.Tensor, **options) -> torch
 
 
 @pytest.mark.parametrize("name", THEIRS)
-def test_steps_are_those_of_diffusers(name):
+def test_solver_steps_are_those_of_diffusers(name):
     """But for the last one, of second order here, and UniPC's first corrector, which is simplified there."""
     THEIRS["euler"].set_timesteps(11)
     sigmas = THEIRS["euler"].sigmas.tolist()

@@ -59,7 +59,7 @@ def make(unet: Any, kind: str = "v_prediction") -> DistillObjective:
 
 
 @pytest.mark.parametrize("mean", [-2.0, 0.0, 2.0])
-def test_what_is_drawn_is_moved_from_what_the_critic_knows_to_what_the_teacher_does(mean: float) -> None:
+def test_distillation_moves_latents_from_the_critics_prediction_to_the_teachers(mean: float) -> None:
     objective = make(Gaussians(DDPMScheduler(**SCHEDULE), teacher=mean, critic=0.0), "sample")
     drawn = torch.randn(64, 1, 8, 8)
     moved = objective.moved(drawn, {}, {}) - drawn

@@ -20,7 +20,7 @@ def measured(indentation: torch.Tensor, compliance: float = 0.0) -> dict[str, fl
     return dict(zip(ATTRIBUTES, values.tolist(), strict=True))
 
 
-def test_of_a_ball() -> None:
+def test_attributes_of_a_ball() -> None:
     radius = 6.0
     depth = 0.5
     x = 2.0
@@ -39,7 +39,7 @@ def test_of_a_ball() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 2.5])
-def test_of_waves(angle: float) -> None:
+def test_attributes_of_waves(angle: float) -> None:
     period, height = 2.0, 0.1
     wave = height * torch.cos(2 * math.pi / period * (math.cos(angle) * X + math.sin(angle) * Y)) + 2 * height
     found = measured(wave)
@@ -53,13 +53,13 @@ def test_of_waves(angle: float) -> None:
     assert shorter["coarse relief"] < found["coarse relief"]
 
 
-def test_of_nothing_touched() -> None:
+def test_attributes_where_nothing_is_touched() -> None:
     found = measured(torch.zeros(SIZE, SIZE))
     assert all(map(math.isfinite, found.values()))
     assert found["cover"] == found["place x"] == found["place y"] == found["extent"] == 0.0
 
 
-def test_maps_of_a_slope_and_of_waves() -> None:
+def test_contact_maps_of_a_slope_and_of_waves() -> None:
     deep, slope_x, slope_y, _ = contact_maps((2.0 + 0.1 * X - 0.05 * Y)[None], VIEW)[0]
     middle = (torch.arange(CELLS) + 0.5) * VIEW / CELLS - VIEW / 2
     expected = torch.log(2.0 + 0.1 * middle[None, :] - 0.05 * middle[:, None] + 0.02)
@@ -72,7 +72,7 @@ def test_maps_of_a_slope_and_of_waves() -> None:
     assert steep.exp().mean() == pytest.approx((0.1 * math.pi) ** 2 / 2, rel=0.06)
 
 
-def test_the_blur_is_scipys() -> None:
+def test_gaussian_blur_is_scipys() -> None:
     field = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(0))
     expected = gaussian_filter(field[0].double().numpy(), 3.0, mode="nearest", truncate=8 / 3)
     torch.testing.assert_close(gaussian_blur(field, 3.0)[0], torch.from_numpy(expected).float(), rtol=0, atol=1e-5)

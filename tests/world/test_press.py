@@ -41,7 +41,7 @@ def test_twice_the_width_is_twice_the_size_and_fine_maps_are_averaged() -> None:
     assert press(stripes, 20.0, SHARP, 0.5, seed=None).depth.std() < 1e-3
 
 
-def test_a_plane_gives_nothing() -> None:
+def test_pressing_a_plane_leaves_the_gel_untouched() -> None:
     plane = 0.002 * 16.0 * AXIS[None, :] * np.ones((400, 1))
     made = press(plane, mm=16.0, sensor=PLAIN, seed=None)
     inside = (slice(None), slice(16, -16), slice(16, -16))

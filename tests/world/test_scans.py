@@ -192,7 +192,7 @@ def test_lengths_are_in_the_range_that_is_told() -> None:
     assert draws.colour.max() <= 0.98
 
 
-def test_what_is_said_of_a_scan_is_measured_of_it() -> None:
+def test_captions_and_answers_of_a_scan_are_measured_of_it() -> None:
     draws = World(scanned=1.0).draw(*contacts([0, 601]))
     names = [MATERIAL_NAMES[number] for number in draws.material.tolist()]
     for variant in range(4):

@@ -67,7 +67,7 @@ def test_rows_are_what_the_processor_makes_of_files_and_decoded_once(folder, tmp
         assert split.text[row] == f"n{number}"
 
 
-def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, processor: UniTouchProcessor) -> None:
+def test_a_changed_data_set_has_another_fingerprint(folder: Path, tmp_path: Path, processor: UniTouchProcessor) -> None:
     before = columns(folder, tmp_path, processor, "touch")[0]
     table = (folder / "labels.csv").read_text()
     (folder / "labels.csv").write_text(table.replace("0.wav,digit,wood", "0.wav,digit,glass"))
@@ -78,7 +78,7 @@ def test_what_has_changed_has_another_fingerprint(folder: Path, tmp_path: Path, 
     assert np.abs(after.touch[3].reshape(3, -1).mean(axis=1) - RED).max() < 1
 
 
-def test_what_is_in_the_cache_is_not_computed_again(tmp_path: Path) -> None:
+def test_computed_once_reads_its_cache(tmp_path: Path) -> None:
     values = torch.rand(7, 3)
     file = tmp_path / "cache" / "values.safetensors"
     assert torch.equal(computed_once(file, lambda: values), values)
@@ -95,7 +95,7 @@ def test_broken_files_are_refused_in_a_list_and_leave_no_cache(folder, tmp_path,
 
 
 @pytest.mark.parametrize("need", ["image", "text", "audio"])
-def test_what_a_record_lacks_is_named_before_anything_is_decoded(need, folder, tmp_path, processor) -> None:
+def test_columns_name_what_a_record_lacks_before_anything_is_decoded(need, folder, tmp_path, processor) -> None:
     cells = {"image": "picture4.png", "text": "n4", "audio": "4.wav"}
     header, *rows = (folder / "labels.csv").read_text().splitlines()
     rows[4] = ",".join("" if cell == cells[need] else cell for cell in rows[4].split(","))

@@ -26,7 +26,7 @@ def splits(place: Path, _processor: UniTouchProcessor) -> list[Contacts]:
     return columns_of(SOURCES, place, CONFIG, _processor, ("image", "touch", "sensor"))
 
 
-def test_what_is_rendered_is_the_worlds(splits: list[Contacts], processor: UniTouchProcessor) -> None:
+def test_drawn_columns_are_what_the_world_renders(splits: list[Contacts], processor: UniTouchProcessor) -> None:
     assert [source.name for source in SOURCES] == ["drawn-any", "drawn-digit"]
     for split, source in zip(splits, SOURCES, strict=True):
         names = source.contacts("train")
@@ -78,7 +78,7 @@ def test_a_fingerprint_is_of_one_world_and_names_its_cache() -> None:
     assert prints[0] == prints[-1]
 
 
-def test_what_is_cached_is_mapped_and_the_same(splits, place, processor, tmp_path: Path) -> None:
+def test_cached_columns_are_mapped_and_the_same(splits, place, processor, tmp_path: Path) -> None:
     files = {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")}
     [again] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
     assert {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")} == files

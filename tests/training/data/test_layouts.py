@@ -180,7 +180,7 @@ def test_files_that_are_not_read_are_named(make: Callable, tmp_path: Path) -> No
     assert expected in open_dataset(tmp_path).notes
 
 
-def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
+def test_open_dataset_keeps_the_sensor_and_materials_it_is_told(tmp_path: Path) -> None:
     object_folder(tmp_path)
     names = ["wood", "steel", "polycarbonate", "plastic", "iron", "ceramic", "glass"]
     data = open_dataset(tmp_path, sensor="mine", materials=names)
