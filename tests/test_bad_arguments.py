@@ -75,7 +75,7 @@ def test_a_message_says_what_came_and_what_is_wanted():
     ):
         name = next(iter(values))
         said = f"^{re.escape(message)}$"
-        check_refusal(partial(check_fields, SamplingArguments, **values), name, said, kind=error, given=values[name])
+        check_refusal(partial(check_fields, SamplingArguments, values), name, said, kind=error, given=values[name])
 
 
 def test_numbers_and_tensors_out_of_bounds_are_refused():
@@ -354,7 +354,7 @@ STEPS: list[Row] = [
 
 def test_steps_that_cannot_be_made_are_refused():
     def make(scheduler: Any, **arguments: Any) -> None:
-        prepare_steps(scheduler, check_fields(SamplingArguments, **arguments))
+        prepare_steps(scheduler, check_fields(SamplingArguments, arguments))
 
     check(make, STEPS, scheduler=PROBLEMS["gaussian"].scheduler())
 

@@ -12,7 +12,7 @@ from tests.helpers.components import clip_tokenizer, joint_config
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import denormalise_pixels
 from unitouch_gen.models.texture import TAPPED, TextureTrunk
-from unitouch_gen.training.texture import TRUNK, read_trunk
+from unitouch_gen.training.texture import TRUNK, TextureLosses, TextureObjective, read_trunk
 from unitouch_gen.training.touch import LossWeights, TouchEncoder
 
 
@@ -90,3 +90,14 @@ def test_the_trunk_of_a_joint_space_is_read_where_it_has_one(tmp_path: Path) -> 
     torch.testing.assert_close(read(images), trunk.half().float()(images))
     save_file({"touch_model.proj": torch.ones(1)}, tmp_path / "model.safetensors")
     assert read_trunk(tmp_path) is None
+
+
+def test_only_changes_of_drawn_contacts_are_penalised() -> None:
+    weights = dict.fromkeys(("image", "touch", "text", "image_name", "touch_name", "drawn", "drawn_touch"), 1.0)
+    objective = TextureObjective(with_texture(), TextureLosses(**weights), torch.eye(3, 32))
+    embeds = torch.eye(4, 32)
+    batch = {"touch_embeds": embeds, "drawn": torch.tensor([1.0, 1.0, 0.0, 0.0])}
+    turned = torch.stack([embeds[0], embeds[0], -embeds[2], -embeds[3]])  # by 0, 90, 180 and 180 degrees
+    torch.testing.assert_close(objective.change(turned, batch, "touch"), torch.tensor(0.5))
+    batch["drawn"] = torch.zeros(4)
+    assert objective.change(turned, batch, "touch") == 0.0

@@ -153,7 +153,8 @@ def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differen
 def test_the_error_of_features_is_that_of_a_stem_relative_to_what_it_sees() -> None:
     layer = nn.Conv2d(3, 4, 3)
     deviation = torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]  # CLIP's
-    shown, wanted = (to_signed(torch.from_numpy(pictures)) for pictures in (PICTURES[::-1].copy(), PICTURES))
+    shown, wanted = (torch.from_numpy(pictures).float() / 255 for pictures in (PICTURES[::-1].copy(), PICTURES))
+    features = image_vae.StemFeatures([layer])
     with torch.no_grad():
         apart = F.conv2d((shown - wanted) / deviation, layer.weight).abs().mean(dim=(0, 2, 3))
         size = F.conv2d(wanted / deviation, layer.weight).transpose(0, 1).flatten(1).std(dim=1)  # of what varies

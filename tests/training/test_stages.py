@@ -236,7 +236,8 @@ def test_a_family_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Ca
     checkpoint = tmp_path / "image_text" / "checkpoints" / "step-00000001"
     checkpoint.mkdir(parents=True)
     lines = remaining(tmp_path, capsys)
-    assert len(lines) == len(RUNS) - 1 and " --recipe image_text_lamps " in lines[0]  # it has saved nothing yet
+    assert len(lines) == len(RUNS) - 1
+    assert " --recipe image_text_lamps " in lines[0]  # it has saved nothing yet
     (checkpoint / "progress.json").write_text("{}")
     assert remaining(tmp_path, capsys)[0] == (
         f"python -m unitouch_gen.training image_text --init {tmp_path}/captions/model "
@@ -250,7 +251,8 @@ def test_a_family_stops_at_a_stage_that_fails(tmp_path: Path, capfd: pytest.Capt
     with pytest.raises(SystemExit, match="2"):
         run_commands(app, "unitouch_gen.training", ["family", "--runs", str(tmp_path / "runs")])
     [error] = capfd.readouterr().err.splitlines()
-    assert str(tmp_path / "runs" / "captions") in error and "cannot be written to" in error
+    assert str(tmp_path / "runs" / "captions") in error
+    assert "cannot be written to" in error
 
 
 needs_checkout = pytest.mark.skipif(not (CHECKOUT / "Makefile").is_file(), reason="there is no checkout")

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
 from tests.helpers.plain_sensor import touch_images
-from unitouch_gen.world import MODALITIES, SENSORS, Scene, World, draw_sensor
+from unitouch_gen.world import SCENE_MODALITIES, SENSORS, Scene, World, draw_sensor
 from unitouch_gen.world.scene import YIELD, grasp_margin
 from unitouch_gen.world.surfaces import surfaces
 
@@ -111,10 +111,10 @@ class Elements(TorchDispatchMode):
 def test_rendering_one_modality_computes_less_than_all() -> None:
     index = torch.arange(2)
     counts = {}
-    for names in (MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
+    for names in (SCENE_MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
         with Elements() as elements:
             World().render(index, 0 * index, 0 * index, modalities=names, sensors=tuple(SENSORS))
         counts[names] = elements.count
-    everything = counts.pop(MODALITIES)
+    everything = counts.pop(SCENE_MODALITIES)
     assert max(counts.values()) < 0.9 * everything
     assert counts["text",] < 0.01 * everything

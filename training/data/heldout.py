@@ -110,7 +110,6 @@ Sets = Iterator[tuple[str, int, Splits]]
 
 def of_world(
     cache: Path,
-    model: UniTouchModel,
     processor: UniTouchProcessor,
     sensors: Sequence[str],
     seeds: Sequence[int],
@@ -136,23 +135,11 @@ def of_world(
             recordings=recordings,
         )
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
-        embed_all(model, processor, splits)
-        name = sensor or "sensors drawn anew"
-        known = sensor in model.config.sensors
-        yield name, known, source.seed, splits
+        yield sensor or "sensors drawn anew", source.seed, splits
 
 
 def of_datasets(cache: Path, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
     """Data sets, each in all of its splits."""
     for data in sets:
         splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
-        embed_all(model, processor, splits)
-        known = {record.sensor for record in data.records} <= {*model.config.sensors}
-        yield data.name, known, 0, splits
-
-
-def embed_all(model: UniTouchModel, processor: UniTouchProcessor, splits: Splits) -> None:
-    """Gives contacts their features."""
-    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
-    for contacts in splits.values():
-        contacts.features = embed(model, processor, contacts, classifier)
+        yield data.name, 0, splits

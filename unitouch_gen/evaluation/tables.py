@@ -85,8 +85,9 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
 def _classified(
     splits: Splits, label: str, prompt: Callable[[str], str], embed: Embed, *, balanced: bool = False
 ) -> Figures:
-    """Shares of a label's classes that are named right, by row."""
-    (train, fitted), (val, chosen), (test, known) = (_labelled(splits[split], label) for split in SPLITS)
+    train, fitted = _labelled(splits["train"], label)
+    val, chosen = _labelled(splits["val"], label)
+    test, known = _labelled(splits["test"], label)
     classes = embed([prompt(name) for name in splits["test"].classes[label]])
     predicted = {"majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
     for name, row in PROBED.items():

@@ -69,8 +69,8 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp
     for sensor in model.config.sensors:
         model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3))
     data = open_dataset(folder)
-    [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
-    assert not known
+    [(_, _, splits)] = of_datasets(tmp_path / "cache", processor, [data])
+    embed_all(model, processor, splits, CLASSIFIER)
     assert [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
     test = splits["test"]
     record = parts_of(data)["test"].records[1]
