@@ -140,7 +140,7 @@ IMAGES: list[Row] = [
         "touch", bad(1.5), bad(-0.1), bad(300, int), bad(-1, int), bad(2**63, np.uint64), bad(1e300, float), said=RANGE
     ),
     ({"touch": torch.full((3, 16, 16), 255.0)}, RANGE),
-    *each("touch", *(Image.fromarray(np.full((16, 16), v, np.int32)) for v in (-1, 70_000)), said="from 0 to 65535"),
+    *each("touch", *(Image.fromarray(np.full((16, 16), v, np.int32)) for v in (-1, 70_000)), said="or to 65535"),
     ({"touch": Image.fromarray(np.full((16, 16), 99.0, np.float32))}, RANGE),
     *each("touch", *map(np.zeros, ((16, 16, 2), (3, 16, 16), (16,), (1, 1, 16, 16, 3), (0, 16, 16, 3))), said=SHAPE),
     *each("touch", *map(torch.zeros, ((16, 16), (4, 16, 16), (16, 16, 3), (0, 3, 16, 16))), said=SHAPE),
@@ -163,7 +163,7 @@ NON_FINITE = [np.where(np.arange(RATE) == 7, value, NOISE.astype(np.float64)) fo
 SOUNDS: list[Row] = [
     ({"audio": "nothing.wav"}, "names '.*nothing.wav', which does not exist"),
     ({"audio": "/"}, "names .*which is a folder"),
-    *each("audio", *((samples, RATE) for samples in NON_FINITE), said="holds samples that are NaN or infinite"),
+    *each("audio", *((samples, RATE) for samples in NON_FINITE), said="holds .* values that are NaN or infinite"),
     ({"audio": NOISE}, "without a sampling rate"),
     ({"audio": (32_767 * NOISE, RATE)}, "holds samples up to 32767; floats run from -1 to 1"),
     *(({"audio": (NOISE, rate)}, f"sampling rate` is {rate}") for rate in (999, 768_001, 16_000.0, True)),
@@ -272,7 +272,7 @@ def test_sensors_that_a_bank_does_not_hold_are_refused():
     bank = SensorBank(("gelsight", "digit"), 5, 16, 8)
     check_refusal(partial(bank.match, torch.zeros(1, 3, 8, 8)), "sensor", "is None.*no prototypes.*gelsight")
     none = SensorBank((), 5, 16, 8)
-    check_refusal(partial(none.match, torch.zeros(1, 3, 8, 8), "digit"), "sensor", "no sensor tokens")
+    check_refusal(partial(none.match, torch.zeros(1, 3, 8, 8), "digit"), "sensor", "without sensor tokens")
 
 
 def test_language_models_that_do_not_fit_a_bridge_are_refused():
@@ -283,7 +283,7 @@ def test_language_models_that_do_not_fit_a_bridge_are_refused():
     bridge = parts["language_bridge"]
     tokens = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2, "vocab_size": 280}
     for change, named, said in (
-        ({"num_hidden_layers": 3}, "num_layers", "2, but the language model 3"),
+        ({"num_hidden_layers": 3}, "num_layers", "2; it has to be 3"),
         ({"hidden_size": 64, "head_dim": 8}, "hidden_size", "32"),
         ({"num_attention_heads": 2}, "num_heads", "4"),
     ):
@@ -331,14 +331,14 @@ STEPS: list[Row] = [
     ({"scheduler": FLOW, "solver": "ddim"}, "has no noise levels"),
     ({"num_inference_steps": 1001}, "is 1001"),
     ({"eta": 0.5, "tolerance": 0.1}, "is 0.5, but has no effect with `tolerance`"),
-    ({"eta": 0.5, "solver": "euler"}, "is 0.5, but 'euler' adds no noise"),
+    ({"eta": 0.5, "solver": "euler"}, "is 0.5, but has no effect with 'euler'"),
     ({"max_evaluations": 1, "tolerance": 0.1}, "is 1"),
     ({"solver": "heun", "timesteps": [9]}, "is 'heun', but has no effect with `timesteps`"),
     ({"timesteps": [9], "tolerance": 0.1}, "is .* no effect with `tolerance`"),
     ({"timesteps": [500, 999]}, "is .*; each has to be below the one before"),
     ({"timesteps": [1000, 1]}, "is 1000"),
     ({"timesteps": 5}, "is"),
-    ({"timesteps": [999, 9]}, "DDIMScheduler chooses its own"),
+    ({"timesteps": [999, 9]}, "DDIMScheduler, which chooses its own"),
     ({"timesteps": [99, 9], "scheduler": diffusers.DDPMScheduler()}, "99, 9], .* starts at timestep 99 of 1000"),
     ({"init_strength": 0.5, "scheduler": FLOW}, "starts at noise alone"),
     (
@@ -385,14 +385,13 @@ AXIS = (np.arange(400) + 0.5) / 400 - 0.5
 BALL = np.sqrt(np.maximum(4.0**2 - (10.0 * AXIS[:, None]) ** 2 - (10.0 * AXIS[None, :]) ** 2, 0.0))  # mm
 MAPS: list[Row] = [
     *each("height", np.zeros((50, 50)), np.full((50, 50), 7, np.uint8), said="is flat; pass a relief"),
-    *each("height", *(np.where(BALL > 3.9, v, BALL) for v in (NAN, INF)), said="that are NaN or infinite; fill them"),
+    *each("height", *(np.where(BALL > 3.9, v, BALL) for v in (NAN, INF)), said="that are NaN or infinite"),
     ({"height": np.ones((1, 1))}, "is 1 x 1 pixels; pass a map of 8 to 8192"),
     ({"height": np.broadcast_to(np.uint8(3), (10_000, 10_000))}, "is 10000 x 10000 pixels; pass a map of 8 to 8192"),
     ({"height": PICTURE}, "is in colours; pass a grey height map"),
-    *each("height", np.zeros((9, 9), np.int32), np.zeros((9, 9), bool), said="pass floats in mm, or uint8 or uint16"),
+    *each("height", np.zeros((9, 9), np.int32), np.zeros((9, 9), bool), said="floats in mm, or uint8 or uint16"),
     ({"height": np.ones(9)}, r"pass heights \(H, W\)"),
     ({"height": []}, "is an empty list; pass at least one"),
-    ({"height": [BALL, BALL[:100]]}, "maps of several shapes"),
     ({"height": None}, "is None; pass a path"),
     ({"height": 3}, "is 3; pass a path"),
     ({"height": "gone.png"}, "which does not exist; pass the path of a height map"),

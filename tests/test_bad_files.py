@@ -187,7 +187,7 @@ def test_places_that_hold_no_model_are_refused(joint):
     folder = joint("1GB")
     for place, said in {
         f"{folder}/nothing/here": "no folder",
-        f"{folder}/..": r"no config\.json",
+        f"{folder}/..": r"config\.json', which does not exist",
         "x" * 5000: "is",
         3: "3",
         "a\0b": "the path of a file or folder",
@@ -195,7 +195,7 @@ def test_places_that_hold_no_model_are_refused(joint):
         "user/no-such-model": "no repository that can be fetched",
     }.items():
         read = partial(UniTouchModel.from_pretrained, place, local_files_only=True)
-        check_refusal(read, PLACE, f"is .*{said}")
+        check_refusal(read, PLACE, f"(is|names) .*{said}")
 
 
 @pytest.mark.parametrize("damage", WEIGHTS)
@@ -229,7 +229,7 @@ def test_an_index_that_leads_out_of_its_folder_is_refused(joint, tmp_path):
     next(folder.glob("model-*.safetensors")).rename(tmp_path / "outside.safetensors")
     names = json.loads(index.read_text())["weight_map"]
     index.write_text(json.dumps({"weight_map": dict.fromkeys(names, "../outside.safetensors")}))
-    with pytest.raises(InvalidInputError, match=rf"{folder}/outside.safetensors` cannot be read"):
+    with pytest.raises(InvalidInputError, match=rf"{folder}/outside.safetensors', which does not exist"):
         read_touch(folder)
 
 
@@ -265,9 +265,9 @@ def test_published_files_that_are_exchanged_or_left_out_are_refused(tmp_path):
     for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
         exchanged = partial(convert, **{name: files[other]}, config=sizes())
         check_refusal(exchanged, "touch", "is for UniTouch's last_new.ckpt")
-    check_refusal(partial(convert, config=sizes()), "touch", "Pass `touch`, `imagebind` or both")
+    check_refusal(partial(convert, config=sizes()), "touch", "Pass at least one of `imagebind`, `touch`")
     named = partial(convert, touch=files["touch"], config=UniTouchConfig(sensors=["digit"]))
-    check_refusal(named, "config", "names sensors")
+    check_refusal(named, "config.sensors", "has no effect on published files")
     assert not (tmp_path / "model").exists()
 
 
@@ -304,7 +304,7 @@ def test_folders_without_a_llama_in_transformers_layout_are_refused(llama, tmp_p
     folder, bridge = llama
     (folder / "config.json").rename(folder / "params.json")
     for place in (folder, tmp_path):
-        said = f"is '{re.escape(str(place))}', .* transformers' layout"
+        said = f"'{re.escape(str(place))}.*transformers' layout"
         check_refusal(partial(read_touch_llm, bridge, place), "llama", said)
 
 

@@ -73,7 +73,7 @@ def test_questions_are_answered_about_every_touch(command, refused, here, capsys
     assert "bright.png: " in printed
     assert all(answer in printed for answer in answers)
     assert command("ask", "in/bright.png", *words[2:])[1] == f"{answers[0]}\n"
-    refused(command(*words[:2], " ", *words[3:]), "`question` is blank")
+    refused(command(*words[:2], " ", *words[3:]), "`question` is ' '")
 
 
 def test_touch_llm_becomes_a_pipeline(command, tmp_path):

@@ -245,6 +245,7 @@ def test_a_family_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Ca
     )
 
 
+@pytest.mark.slow
 def test_a_family_stops_at_a_stage_that_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """With the stage's exit code, after its own message."""
     (tmp_path / "runs").write_text("a file")
