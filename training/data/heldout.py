@@ -94,13 +94,17 @@ def parts_of(data: RecordSet) -> dict[str, RecordSet]:
 
 
 def tenth_of_each_material(data: RecordSet) -> RecordSet:
-    """A tenth of the records of each material, or one, by the hash of their names: where nothing keeps them apart."""
+    """A tenth of the records of each material, by the hash of their names: where nothing keeps them apart.
+
+    At least one, unless it is the only record of its material.
+    """
     materials: dict[int | None, list[Record]] = {}
     for record in sorted(data.records, key=lambda record: sha256(record.id.encode()).digest()):
         materials.setdefault(record.labels.get("material"), []).append(record)
     chosen = list[Record]()
     for records in materials.values():
-        chosen += records[: max(round(len(records) / 10), 1)]
+        count = max(round(len(records) / 10), 1)
+        chosen += records[: min(count, len(records) - 1)]
     return replace(data, records=tuple(chosen), chosen="val, a tenth of train")
 
 

@@ -92,3 +92,17 @@ def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folde
     assert len(set().union(*objects)) == 6
     with pytest.raises(InvalidInputError, match="neither splits nor objects"):
         parts_of(replace(data, apart="none"))
+
+
+def test_a_share_to_validate_on_leaves_each_material_a_record_to_train_on(folder):
+    data = open_dataset(folder)
+    materials = [0] * 6 + [1] * 4 + [2]  # the last one of a single record
+    records = [
+        replace(record, split="train", labels={"material": material})
+        for record, material in zip(data.records, materials, strict=False)
+    ]
+    records.append(replace(data.records[-1], split="test", labels={"material": 0}))
+    parts = parts_of(replace(data, records=tuple(records), apart="none"))
+    counts = {split: [record.labels["material"] for record in parts[split].records] for split in ("train", "val")}
+    assert sorted(counts["val"]) == [0, 1]
+    assert sorted(counts["train"]) == [0] * 5 + [1] * 3 + [2]
