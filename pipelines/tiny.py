@@ -13,7 +13,7 @@ from transformers import AutoTokenizer, LlamaForCausalLM
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
-from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, needed
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, import_optional
 from unitouch_gen.files import as_path, read_network, read_settings, reading
 from unitouch_gen.models import LanguageBridge, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
@@ -108,7 +108,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
 def distilled(pipe: Any, folder: Path) -> Any:
     """A copy of a pipeline with LoRA weights of `unitouch-gen distill` fused into its UNet, and their defaults."""
-    needed("peft")
+    import_optional("peft")
     defaults = read_settings("lora", folder / "defaults.json")
     student = copy.copy(pipe)
     unet = copy.deepcopy(pipe.unet)

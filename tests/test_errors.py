@@ -63,7 +63,7 @@ def test_a_working_folder_that_was_deleted_is_one_line(tmp_path, monkeypatch, ca
     (tmp_path / "gone").rmdir()
     with pytest.raises(SystemExit, match="2"):
         errors.run_commands(typer.Typer(), "unitouch-gen", [])
-    assert capsys.readouterr().err.startswith("unitouch-gen: The working folder has been deleted ")
+    assert capsys.readouterr().err.startswith("unitouch-gen: The working folder has been deleted; ")
 
 
 def test_warnings_of_ours_are_lines_and_others_are_left_out(capsys):

@@ -21,7 +21,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, first_line, needed
+from unitouch_gen.errors import InvalidInputError, check_choice, first_line, import_optional
 from unitouch_gen.files import class_name, read_network, read_settings, reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, read_autoencoder
@@ -152,7 +152,7 @@ def add_layers(unet: UNet2DConditionModel, lora: Arguments, critic_rank: int, in
     With a folder `init`, the student's layers are read from there.
     """
     ranks = {CRITIC: critic_rank, STUDENT: lora.get("r", 8)}  # 8 is peft's default
-    lora_config = needed("peft").LoraConfig
+    lora_config = import_optional("peft").LoraConfig
     configs = {name: build("lora", lora_config, {**lora, "r": rank}, lora_alpha=rank) for name, rank in ranks.items()}
     unet.requires_grad_(False)
     if init is not None:
@@ -260,7 +260,7 @@ def main(stage: Stage, recipe: DistillRecipe) -> None:
     conditioned, dataset = conditioned_by(stage, settings, unet, scheduler, joint, vae)
     guidance_scale = settings["default_guidance_scale"]
     stage.fit(DistillObjective(unet, scheduler, conditioned, recipe.objective, guidance_scale), dataset)
-    layers = needed("peft").get_peft_model_state_dict(unet, adapter_name=STUDENT)
+    layers = import_optional("peft").get_peft_model_state_dict(unet, adapter_name=STUDENT)
     with stage.saving() as output:
         half_precision = {name: tensor.half() for name, tensor in layers.items()}
         StableDiffusionLoraLoaderMixin.save_lora_weights(output, unet_lora_layers=half_precision)

@@ -1,7 +1,7 @@
-"""Error types, and checks of arguments, each of which returns the checked value.
+"""Error types, checks of arguments, and how commands report errors.
 
 A value of a wrong type raises `InvalidTypeError`. Any other value that cannot be used raises `InvalidInputError`. The
-message names the argument, its value, and what to do.
+message names the argument, its value, and what to do. A check that returns something returns the checked value.
 """
 
 import logging
@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
+from types import NoneType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from unitouch_gen.streams import open_standard_streams
@@ -59,7 +60,7 @@ def run_commands(app: Any, name: str, words: Sequence[str] | None = None, **opti
         words = sys.argv[1:]
     words = [expand_home(word) for word in words]
 
-    def say(message: Any, *place: Any) -> None:
+    def say(message: Any, *_: Any) -> None:  # `warnings.showwarning` also passes category, file and line
         one_line = " ".join(str(message).split())
         print(f"{name}: {one_line}", file=sys.stderr)
 
@@ -106,8 +107,10 @@ def interrupt_on_termination() -> None:
 
 def check_working_folder() -> None:
     """Raises if the working folder was deleted, since importing torch would then end the process."""
-    with explain_errors("The working folder has been deleted", "change to one that is there", FileNotFoundError):
+    try:
         os.getcwd()
+    except FileNotFoundError as error:
+        raise InvalidInputError("The working folder has been deleted; change to one that exists.") from error
 
 
 def expand_home(word: str) -> str:
@@ -135,8 +138,8 @@ def first_line(error: BaseException) -> str:
 
 
 @contextmanager
-def explain_errors(problem: str, wanted: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Turns errors of other libraries into an `InvalidInputError` with their first line, between problem and advice.
+def explain_errors(problem: str, advice: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turns errors of some kinds into an `InvalidInputError`: "problem (first line of the error); advice."
 
     An `InvalidInputError` stays as it is.
     """
@@ -146,11 +149,11 @@ def explain_errors(problem: str, wanted: str, *kinds: type[Exception]) -> Iterat
         raise
     except kinds as error:
         why = getattr(error, "strerror", None) or first_line(error).rstrip(".")
-        raise InvalidInputError(f"{problem} ({why}); {wanted}.") from error
+        raise InvalidInputError(f"{problem} ({why}); {advice}.") from error
 
 
-def needed(module: str, extra: str = "train") -> Any:
-    """Imports a module that an extra installs."""
+def import_optional(module: str, extra: str = "train") -> Any:
+    """Imports a module of another package; if it is missing, the error names the extra that installs it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -168,7 +171,7 @@ def did_you_mean(value: Any, choices: Iterable[str]) -> str:
 
 
 def check_arguments(of: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Raises if a name is no argument of a function that would ignore it; private names of libraries pass."""
+    """Raises if a name is no argument of a function, which would ignore it. Private names of libraries pass."""
     for name in names:
         if name not in known and not name.startswith("_"):
             raise InvalidTypeError(f"`{name}` is no argument of {of}. {did_you_mean(name, known)}".strip())
@@ -177,7 +180,7 @@ def check_arguments(of: str, names: Iterable[str], known: Collection[str]) -> No
 def check_kind(name: str, value: Any, *kinds: Any) -> Any:
     """An instance of one of `kinds`."""
     if not isinstance(value, kinds):
-        classes = " or ".join(kind.__name__ for kind in kinds)
+        classes = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a {classes}.")
     return value
 
@@ -240,9 +243,10 @@ def check_fields(model: "type[Model]", values: Any, whole: str = "arguments") ->
 
 
 def check_texts(name: str, value: Any, *, blank: bool = True, repeated: bool = True) -> list[str]:
-    """A string, or a list of at least one, as a list; each can be written in UTF-8.
+    """A string, or a list of at least one string, as a list.
 
-    With `blank` or `repeated` unset, there must be none of those.
+    Raises if a string cannot be encoded in UTF-8. Without `blank`, none may be blank; without `repeated`, each has to
+    be different.
     """
     texts = [value] if isinstance(value, str) else value
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
@@ -290,7 +294,7 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
     elif os.path.isdir(path):
         why = "is a folder"
     elif os.path.exists(path):
-        why = "is no file"
+        why = "is not a regular file"
     else:
         why = "does not exist"
     if why:
@@ -316,23 +320,27 @@ def check_not_empty(name: str, values: Sized) -> None:
 
 
 def check_equal(name: str, what: str, value: Any, expected: Any, why: str) -> None:
-    """Raises unless a property of an argument, such as its "width", is what something else needs; `why` says what."""
+    """Raises unless a property of an argument, such as its "width", is as expected; `why` says what expects it."""
     if value != expected:
         raise InvalidInputError(f"`{name}` has {what} {describe(value)}; it has to be {describe(expected)}, {why}.")
 
 
 def check_passed(arguments: Mapping[str, Any], *, only_one: bool = False) -> dict[str, Any]:
-    """The arguments that have a value: at least one of them, or `only_one`."""
+    """Those of the arguments that are not `None`; raises if all are, or with `only_one` if more than one is not."""
     passed = {name: value for name, value in arguments.items() if value is not None}
     if not passed or (only_one and len(passed) > 1):
         names = ", ".join(f"`{name}`" for name in arguments)
         wanted = "exactly" if only_one else "at least"
-        raise InvalidInputError(f"Pass {wanted} one of {names}, not {len(passed)} of them.")
+        given = f"{len(passed)} were passed" if passed else "none was passed"
+        raise InvalidInputError(f"Pass {wanted} one of {names}; {given}.")
     return passed
 
 
 def check_unused(where: str, **arguments: Any) -> None:
-    """Raises if one of the arguments has a value; none has an effect `where`, such as "with `touch_embeds`"."""
+    """Raises if one of the arguments is not `None`: it has no effect `where`, such as "with `touch_embeds`".
+
+    Pass `value or None` for an argument whose default is False or 0.
+    """
     for name, value in arguments.items():
         if value is not None:
             raise InvalidInputError(f"`{name}` is {describe(value)}, but has no effect {where}; leave it out.")

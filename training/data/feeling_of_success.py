@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, check_file, first_line, needed
+from unitouch_gen.errors import InvalidInputError, check_file, first_line, import_optional
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.records import Frame, Record, find_paths
 
@@ -24,7 +24,7 @@ def read(folder: Path) -> Iterator[Record]:
     for file in find_paths(folder, "*.h5"):
         check_file("path", file, "an HDF5 file")
         try:
-            with needed("h5py").File(file) as opened:
+            with import_optional("h5py").File(file) as opened:
                 attempts = opened["data"]  # what deepdish calls a list that is a file's only value
                 for name in sorted(attempts, key=natural):
                     yield record_of(file, name, attempts[name], finger="A")

@@ -8,7 +8,7 @@ from typing import Any
 from PIL import Image
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, first_line, needed
+from unitouch_gen.errors import InvalidInputError, first_line, import_optional
 from unitouch_gen.files import files_below, is_hidden, natural
 from unitouch_gen.models.images import load_images
 
@@ -27,7 +27,7 @@ class Frame:
         source: Any = self.path
         try:
             if self.key is not None:
-                with needed("h5py").File(self.path) as file:
+                with import_optional("h5py").File(self.path) as file:
                     source = file[self.key][()]
         except (OSError, LookupError, ValueError) as error:  # h5py raises these
             raise InvalidInputError(f"{self.path!r} cannot be read: {first_line(error)}.") from error

@@ -11,7 +11,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import folder_of, kind_of, load_pipeline
-from unitouch_gen.errors import InvalidInputError, explain_errors, needed
+from unitouch_gen.errors import InvalidInputError, explain_errors, import_optional
 
 
 def app(
@@ -43,7 +43,7 @@ def app(
         folders = {kind: str(folder_of(name)) for kind, name in zip(kinds, model, strict=True)}
     with tempfile.TemporaryDirectory(prefix="unitouch-") as uploads:
         isolate_gradio(uploads)
-        needed("gradio", "app")
+        import_optional("gradio", "app")
         from unitouch_gen.cli.page import serving
 
         pipes = {}

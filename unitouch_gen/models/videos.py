@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_file, explain_errors, needed
+from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, check_file, explain_errors, import_optional
 from unitouch_gen.models.images import ImageInput, load_images
 
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
@@ -286,7 +286,7 @@ def read_video(name: str, place: str | os.PathLike) -> Iterator[np.ndarray]:
     Frames that cannot be decoded are left out. Raises `InvalidInputError` if the file cannot be read, or PyAV is
     missing.
     """
-    av: Any = needed("av")
+    av: Any = import_optional("av")
     undecodable = av.FFmpegError  # the module may be gone when Python exits during the loop
     place = os.path.expanduser(place)
     check_file(name, place, "a video")
