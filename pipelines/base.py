@@ -42,7 +42,6 @@ from unitouch_gen.errors import (
     check_multiple,
     check_number,
     check_tensor,
-    check_unused,
 )
 from unitouch_gen.files import LOADING_OPTIONS, as_path, check_filled, check_saved, local_folder, read_settings, reading
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
@@ -79,7 +78,8 @@ The built-in networks stay below it with four rows: two pictures with guidance.
 class SingleThread:
     """A context in which torch computes in the calling thread alone; contexts of several threads may overlap.
 
-    torch has a number for each thread, and one for threads to come. The first context notes that one, all restore it.
+    `torch.set_num_threads` holds for the calling thread and for threads that start later. So the first of overlapping
+    contexts stores the number, and each restores it.
     """
 
     def __init__(self) -> None:
@@ -128,7 +128,7 @@ class Touches:
 
 
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
-    """A network conditioned on embeddings of the joint space.
+    """Base class of pipelines whose network is conditioned on embeddings of the joint space.
 
     Subclasses have the components `unitouch` and `processor`; those that make images also have `unet`, `scheduler`,
     `vae` and `embedding_bank`.
@@ -142,15 +142,15 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _card = Card()
     _record: Mapping[str, Any] = {}  # of the network's training; `distill` reads it in a saved folder
 
-    def _finish_init(self, network: str, **defaults: Any) -> None:
+    def _finish_init(self, network_name: str, **defaults: Any) -> None:
         """The end of a constructor: defaults of a call go into the config, and the widths of embeddings are checked."""
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
         self._num_weights = self.unet.num_parameters()
-        self._check_widths(network)
+        self._check_widths(network_name)
 
-    def _check_widths(self, network: str) -> None:
+    def _check_widths(self, network_name: str) -> None:
         """Raises if the joint space or the bank has embeddings of another width than the network takes."""
         widths = {
             "unitouch": self.unitouch and self.unitouch.config.projection_dim,
@@ -158,7 +158,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         }
         for name, width in widths.items():
             if width is not None:
-                check_equal(name, "width", width, self.embedding_dim, f"as {network} takes")
+                check_equal(name, "width", width, self.embedding_dim, f"as {network_name} takes")
 
     def _require(self, argument: str, *parts: str, instead: str = "pass embeddings") -> None:
         """Raises if a component that an argument needs is missing; `instead` is what a user can do without it."""
@@ -168,24 +168,19 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 f"`{argument}` needs {missing}, which this pipeline lacks; build it with them, or {instead}."
             )
 
-    def _joint(self, argument: str) -> Any:
-        """The joint space, for an argument which needs it."""
-        self._require(argument, "unitouch", "processor")
-        return self.unitouch
-
     # Checks of a call, before any network runs ------------------------------------------------------------------------
 
     def _check_arguments(self, **given: Any) -> SamplingArguments:
-        """The arguments of a call, checked, with the checkpoint's steps and bank where they are `None`."""
+        """The arguments of a call, checked; steps and `bridge` that are `None` become the checkpoint's defaults."""
         arguments = check_fields(SamplingArguments, given)
         config = self.config
         changes: dict[str, Any] = {}
         if arguments.tolerance is None and arguments.timesteps is None:
             steps = arguments.num_inference_steps
-            usual = steps in (None, config.default_num_inference_steps)
-            own_steps = usual and arguments.solver is None and arguments.init_strength == 1.0
+            is_default = steps in (None, config.default_num_inference_steps)
+            is_whole_run = is_default and arguments.solver is None and arguments.init_strength == 1.0
             takes_timesteps = "timesteps" in signature(self.scheduler.set_timesteps).parameters
-            if config.default_timesteps is not None and own_steps and takes_timesteps:
+            if config.default_timesteps is not None and is_whole_run and takes_timesteps:
                 changes |= {"timesteps": config.default_timesteps, "num_inference_steps": None}
             elif steps is None:
                 changes["num_inference_steps"] = config.default_num_inference_steps
@@ -196,7 +191,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return arguments.model_copy(update=changes)
 
     def _latents_shape(self, inputs: int, arguments: SamplingArguments) -> tuple[int, int, int, int]:
-        """(B n, C, h, w), for the size of the pictures, which the UNet was trained at where a call says none."""
+        """Shape (B n, C, h, w) of the latents. A call without a height or width takes those of the UNet's training."""
         trained = self.unet.config.sample_size  # one side, or (height, width)
         if not isinstance(trained, list | tuple):
             trained = (trained, trained)
@@ -204,8 +199,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         for name, side in zip(("height", "width"), trained, strict=True):
             pixels = getattr(arguments, name)
             if pixels is None:
-                # A UNet may have no size of its own.
-                pixels = check_integer(name, side, 1) * self.vae_scale_factor
+                pixels = check_integer(name, side, 1) * self.vae_scale_factor  # raises for a UNet without a size
             check_multiple(name, pixels, self.vae_scale_factor)
             sides.append(pixels // self.vae_scale_factor)
         return (inputs * arguments.num_images_per_prompt, self.unet.config.out_channels, *sides)
@@ -221,26 +215,33 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         callback_on_step_end: Any,
         callback_on_step_end_tensor_inputs: Any,
     ) -> None:
-        """Raises on arguments of a call that do not fit its latents, of a shape (B n, C, h, w), or each other."""
+        """Raises on arguments of a call that do not fit the `shape` (B n, C, h, w) of its latents, or each other."""
         if latents is not None:
             check_tensor("latents", latents, *shape)
         generators = generator if isinstance(generator, list) else [generator]
-        check_count("generator", len(generators), shape[0])
+        if len(generators) not in (1, shape[0]):
+            raise InvalidInputError(
+                f"`generator` holds {len(generators)} for {shape[0]} pictures; pass one, or one for each picture."
+            )
         for one in generators:
             check_kind("generator", one, torch.Generator, NoneType)
         lora = check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, NoneType) or {}
         check_number("cross_attention_kwargs['scale']", lora.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
         check_kind("callback_on_step_end", callback_on_step_end, Callable, NoneType)
-        if isinstance(callback_on_step_end, DIFFUSERS_CALLBACKS):
-            check_unused("with a `callback_on_step_end` that counts steps", tolerance=arguments.tolerance)
+        if isinstance(callback_on_step_end, DIFFUSERS_CALLBACKS) and arguments.tolerance is not None:
+            raise InvalidInputError(
+                "`callback_on_step_end` is one of `diffusers.callbacks`, which need a number of steps; leave out "
+                "`tolerance`, or pass a function."
+            )
         for name in check_kind("callback_on_step_end_tensor_inputs", callback_on_step_end_tensor_inputs, list, tuple):
             check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
 
     # From inputs to embeddings ----------------------------------------------------------------------------------------
 
     def _read_touches(self, touch: ImageInput, sensor: SensorNames, background: ImageInput = None) -> Touches:
-        """Touches with the sensor of each, named or retrieved; by their backgrounds, where there are any."""
-        _, sensor_bank = self._joint("touch").load("touch")
+        """Touches with the sensor of each: named, or retrieved by the touch or, where one is passed, its background."""
+        self._require("touch", "unitouch", "processor")
+        _, sensor_bank = self.unitouch.load("touch")
         pixels = self.processor.raw_touch(touch)
         if background is None:
             return Touches(pixels, sensor_bank.match(pixels, sensor))
@@ -249,7 +250,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         backgrounds = backgrounds.expand_as(pixels)
         matches = sensor_bank.match(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
-            check_unused("on a model without sensor prototypes", background=background)
+            raise InvalidInputError("`background` cannot be used: this model has no sensor prototypes; leave it out.")
         return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
@@ -283,7 +284,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(failed[:, None], float("nan"))
 
     def _encode_pictures(self, pictures: Sequence[Tensor], shape: Sequence[int]) -> Tensor:
-        """Scaled latents (B, C, h, w) of pictures of `load_images`, cropped to the size of latents of a shape."""
+        """Scaled latents (B, C, h, w) of pictures from `load_images`, which are cropped to the size of the `shape`."""
         height, width = (side * self.vae_scale_factor for side in shape[-2:])
         pixels = torch.stack([centre_rectangle(picture, height, width) for picture in pictures])
         return encode(self.vae, 2.0 * pixels - 1.0).float()
@@ -301,17 +302,19 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """The state to start from, float32 (B n, C, h, w): noise at the first noise level of the steps.
 
         Args:
-            steps: Of `prepare_steps`; the state is in the scale of its scheduler, or variance-exploding.
+            steps: A scheduler or noise levels, from `prepare_steps`. For a scheduler, the state is in its scale; for
+                noise levels, it is variance-exploding.
             latents: Unit-variance noise, drawn if `None`.
             init: Scaled latents that the noise is added to (SDEdit; Meng et al., 2022).
         """
         device = self._execution_device
         if latents is None:
-            # A seed is the same noise in float64.
+            # A seed draws the same noise for a UNet in float64 as in float32.
             dtype = torch.float32 if self.unet.dtype == torch.float64 else self.unet.dtype
             latents = randn_tensor(shape, generator=generator, device=device, dtype=dtype)
         noise = latents.to(device, torch.float32)
         if isinstance(steps, list):
+            # x = z / alpha, with alpha = 1 / sqrt(1 + sigma^2)
             return noise * math.hypot(1.0, steps[0]) if init is None else init + steps[0] * noise
         if init is None:
             return noise * steps.init_noise_sigma
@@ -383,7 +386,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             for step, timestep in enumerate(timesteps):
                 z = scheduler.scale_model_input(latents, timestep)
                 if step > 0:
-                    status.update(step - 1, z)
+                    status.update(step - 1, z)  # of z, since `latents` may be in another scale
                 if end_step is not None and self._interrupt:
                     ended = ReturnCode.INTERRUPTED
                     break
@@ -394,7 +397,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 if end_step is not None:
                     latents = end_step(step, timestep, latents)
                 bar.update()
-            else:
+            else:  # not interrupted
                 status.update(step, latents)
         status.conclude(report, denoise, ended, arguments.throw)
         return latents
@@ -412,7 +415,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> Tensor:
         """A named solver, or adaptive steps."""
         adaptive = arguments.tolerance is not None
-        total = 100 if adaptive else len(sigmas) - 1
+        total = 100 if adaptive else len(sigmas) - 1  # 100 % of the way in log sigma
         status = SampleStatus(len(x), x.device)
         self._num_timesteps = total
         report.solver = arguments.solver or "adaptive"
@@ -424,7 +427,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             latents = x * alpha(sigma)
             if end_step is not None:
                 changed = end_step(step, denoise.timestep(begin, x.device), latents.clone())
-                x = torch.where(changed == latents, x, changed / alpha(sigma))
+                x = torch.where(changed == latents, x, changed / alpha(sigma))  # exact where nothing was changed
                 latents = changed
             status.update(step, latents)
             report.steps = step + 1

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from unitouch_gen.arguments import SamplingArguments
 from unitouch_gen.conditioning import mix_linear, mix_to_norm
-from unitouch_gen.errors import InvalidInputError, check_count, check_number
+from unitouch_gen.errors import InvalidInputError, check_number
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.pipelines.base import (
     Generators,
@@ -154,7 +154,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         touches = self._read_touches(touch, sensor, background)
         photos = load_images("image", image)
         batch_size = max(len(photos), len(touches.pixels))
-        check_count("image, touch", min(len(photos), len(touches.pixels)), batch_size)
+        if min(len(photos), len(touches.pixels)) not in (1, batch_size):
+            counts = f"{len(photos)} for {len(touches.pixels)} of `touch`"
+            raise InvalidInputError(f"`image` holds {counts}; pass one of either, or as many of both.")
         shape = self._latents_shape(batch_size, arguments)
         guidance = Guidance(arguments.guidance_scale)
         self.check_inputs(

@@ -107,7 +107,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         )
         width = self.embedding_dim
         labels = unet.config.projection_class_embeddings_input_dim
-        check_equal("unet", "class labels of width", labels, 2 * width, "twice that of the embeddings")
+        check_equal("unet", "class labels of width", labels, 2 * width, "twice the width of the embeddings")
         self._finish_init(
             "the unCLIP model",
             default_strength=default_strength,
@@ -390,7 +390,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     def _encode_prompts(
         self,
         prompts: list[list[str] | Tensor],
-        images: int,
+        num_images: int,
         cross_attention_kwargs: dict[str, Any] | None,
         report: RunReport,
     ) -> Tensor:
@@ -402,7 +402,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             for prompt in prompts:
                 states = prompt if isinstance(prompt, Tensor) else self._encode_prompt(prompt, lora_scale)
                 states = states.to(device, self.unet.dtype)
-                branches.append(states.repeat_interleave(images // len(states), dim=0))
+                branches.append(states.repeat_interleave(num_images // len(states), dim=0))
         if all(isinstance(prompt, Tensor) for prompt in prompts):
             report.left_out.append("prompt encoder")
         return torch.cat(branches)
@@ -471,15 +471,16 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> Self:
         """Builds on published weights: an unCLIP model and a converted joint space.
 
-        Touches are rescaled to the norm of image embeddings that the unCLIP's normaliser tells of.
+        Touches are rescaled to the norm of image embeddings, which follows from the mean and standard deviation in the
+        unCLIP's normaliser.
 
         Args:
             unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
                 image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
             dtype: dtype of the networks.
-            variant, revision: Of the unCLIP's files, such as "fp16".
-            cache_dir, token, local_files_only: Of downloads, as in `from_pretrained`.
+            variant, revision: Variant, such as "fp16", and revision of the unCLIP's files.
+            cache_dir, token, local_files_only: Options of downloads, as in `from_pretrained`.
 
         Raises:
             InvalidInputError: If a model cannot be read, or their embeddings differ in width.

@@ -182,7 +182,7 @@ class TouchToTextPipeline(UniTouchPipeline):
             return name, touches, len(touches.pixels)
         check_unused("without `touch`", sensor=sensor, background=background)
         if name == "image":
-            self._joint("image")
+            self._require("image", "unitouch", "processor")
             pixel_values = self.processor.images(image)
             return name, pixel_values, len(pixel_values)
         embeds = check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)

@@ -99,11 +99,16 @@ class XToTouchPipeline(UniTouchPipeline):
             default_num_inference_steps=default_num_inference_steps,
             default_timesteps=default_timesteps,
         )
-        check_equal("unet", "`class_embed_type`", unet.config.class_embed_type, None, "for labels of sensors")
-        others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
-        labels = unet.config.num_class_embeds or 0
-        check_equal("sensors", "length", len(sensors), labels - others, "as many as `unet` has labels of them")
-        if others:
+        kind = unet.config.class_embed_type
+        if kind is not None:
+            raise InvalidInputError(f"`unet` has `class_embed_type` {kind!r}; sensors need one without that setting.")
+        has_unnamed = self.takes_background and bool(sensors)  # the last label is then for unnamed sensors
+        labels = (unet.config.num_class_embeds or 0) - has_unnamed
+        if len(sensors) != labels:
+            raise InvalidInputError(
+                f"`sensors` holds {len(sensors)} names, but `unet` has labels for {labels}; pass one name for each."
+            )
+        if has_unnamed:
             stored = 0 if backgrounds is None else backgrounds.config["count"]
             check_equal("backgrounds", "length", stored, len(sensors), "one for each of `sensors`")
 
@@ -202,13 +207,13 @@ class XToTouchPipeline(UniTouchPipeline):
         modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions: Conditions = {}
         if condition_embeds is None:
-            conditions, inputs = self._read_conditions(modalities, weights, source_sensor)
+            conditions, num_inputs = self._read_conditions(modalities, weights, source_sensor)
         else:
             check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
             others = {**modalities, "weights": weights, "source_sensor": source_sensor, "bridge": bridge or None}
             check_unused("with `condition_embeds`", **others)
-            inputs = len(condition_embeds)
-        backgrounds, sensors = self._read_sensors(sensor, background, inputs)
+            num_inputs = len(condition_embeds)
+        backgrounds, sensors = self._read_sensors(sensor, background, num_inputs)
         batch_size = len(sensors)
         shape = self._latents_shape(batch_size, arguments)
         guidance = Guidance(arguments.guidance_scale)
@@ -231,7 +236,7 @@ class XToTouchPipeline(UniTouchPipeline):
             if conditions:
                 with report.stage("condition"):
                     embeds = self._encode(conditions, arguments, report)
-            embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
+            embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // num_inputs, dim=0)
             hidden_states = embeds.to(self.unet.dtype).repeat_interleave(images_each, dim=0)
             labels = torch.tensor(sensors, device=self._execution_device).repeat_interleave(images_each)
             concat = self._background_latents(backgrounds, labels, shape) if self.takes_background else None
@@ -281,8 +286,8 @@ class XToTouchPipeline(UniTouchPipeline):
         """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         arguments = self._check_arguments(bridge=bridge)
         modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions, inputs = self._read_conditions(modalities, weights, source_sensor)
-        with self._threads(self._latents_shape(inputs, arguments), Guidance(1.0)):
+        conditions, num_inputs = self._read_conditions(modalities, weights, source_sensor)
+        with self._threads(self._latents_shape(num_inputs, arguments), Guidance(1.0)):
             return self._encode(conditions, arguments, RunReport())
 
     def _encode(self, conditions: Conditions, arguments: SamplingArguments, report: RunReport) -> Tensor:
@@ -313,9 +318,9 @@ class XToTouchPipeline(UniTouchPipeline):
     def _read_conditions(
         self, modalities: Mapping[str, Any], weights: Mapping[str, float] | None, source_sensor: SensorNames
     ) -> tuple[Conditions, int]:
-        """The modalities that were passed, read, with their weights; and the number of inputs, B."""
+        """The modalities that were passed, read, with their weights; and the number of inputs."""
         modalities = check_passed(modalities)
-        self._joint(next(iter(modalities)))
+        self._require(next(iter(modalities)), "unitouch", "processor")
         if "touch" not in modalities:
             check_unused("without `touch`", source_sensor=source_sensor)
         inputs: dict[str, Any] = {}
@@ -329,37 +334,39 @@ class XToTouchPipeline(UniTouchPipeline):
             else:
                 inputs[name] = self.processor.inputs(name, modalities[name])
                 sizes[name] = len(next(iter(inputs[name].values())))
-        batch_size = max(sizes.values())
+        num_inputs = max(sizes.values())
         for name, size in sizes.items():
-            check_count(name, size, batch_size)
+            check_count(name, size, num_inputs)
         weights = dict.fromkeys(modalities, 1.0) if weights is None else weights
         if set(check_kind("weights", weights, Mapping)) != set(modalities):
             named = ", ".join(map(str, weights))
             passed = ", ".join(modalities)
-            raise InvalidInputError(f"`weights` is of {named}, but {passed} was passed; weigh each of those.")
+            raise InvalidInputError(f"`weights` has keys {named or 'none'}, not {passed}; pass one weight for each.")
         shares = check_weights("weights", [weights[name] for name in inputs])
         conditions = {name: (share, inputs[name]) for name, share in zip(inputs, shares, strict=True) if share > 0}
-        return conditions, batch_size
+        return conditions, num_inputs
 
-    def _read_sensors(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
+    def _read_sensors(
+        self, sensor: SensorNames, background: ImageInput, num_inputs: int
+    ) -> tuple[list[Tensor], list[int]]:
         """Pictures of untouched sensors that were passed, and the sensor label of each touch image, input by input.
 
-        Labels are indices in `config.sensors`; default 0. With pictures it is one past the last.
+        Labels are indices in `config.sensors`, default 0. Touches with a picture have the label after the last one.
         """
         names = list(self.config.sensors)
         pictures: list[Tensor] = []
         if background is not None:
             if not self.takes_background:
-                check_unused("on a model that takes none", background=background)
+                raise InvalidInputError("`background` cannot be used: this model takes none; leave it out.")
             check_unused("with `background`", sensor=sensor)  # a named sensor has its own
             pictures = load_images("background", background)
             labels = [len(names)] * len(pictures)
         elif not names and self.takes_background:
             raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its picture.")
         elif isinstance(sensor, str) and sensor == ALL:
-            return [], list(range(max(len(names), 1))) * inputs
+            return [], list(range(max(len(names), 1))) * num_inputs
         elif not names:
-            check_unused("on a model that draws one only", sensor=sensor)
+            check_unused("on a model of one sensor", sensor=sensor)
             labels = [0]
         else:
             chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
@@ -367,4 +374,4 @@ class XToTouchPipeline(UniTouchPipeline):
             labels = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
         name = "sensor" if background is None else "background"
         check_not_empty(name, labels)
-        return pictures, labels if inputs == 1 else one_each(name, labels, inputs)
+        return pictures, labels if num_inputs == 1 else one_each(name, labels, num_inputs)

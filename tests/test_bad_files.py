@@ -119,8 +119,8 @@ def test_files_that_are_no_height_maps_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"a,b\n1\n", "other columns in row 1"),
-        (b"a,a\n1,2", "two of one name"),
+        (b"a,b\n1\n", "another number of columns in row 1"),
+        (b"a,a\n1,2", "two columns of one name"),
         (b"a,b", "no rows"),
         (b'a\n"b', "is no table: .*line 2"),
         ("k\xe4fer\n1".encode("cp1252"), "save it as UTF-8"),

@@ -59,7 +59,7 @@ LOADING_OPTIONS = (
     "use_safetensors",
     "variant",
 )
-"""Options that diffusers and transformers pass to every `from_pretrained`, and options of downloads."""
+"""Options that every `from_pretrained` of diffusers or transformers accepts, and options of downloads."""
 
 _LOADING = threading.RLock()  # libraries patch torch in all threads while they read networks
 
@@ -169,6 +169,7 @@ def finish_save(folder: Path) -> None:
     if not is_unfinished(folder):
         return
     file = folder / UNFINISHED
+    # What a plan holds may be of any type.
     with explain_errors(f"`{file}` is no plan of a save", "save again", ValueError, TypeError, LookupError):
         plan = json.loads(file.read_text())
         moves = [[path_inside(str(file), folder, place) for place in move] for move in plan["moves"]]
@@ -185,7 +186,7 @@ def finish_save(folder: Path) -> None:
 
 
 def path_inside(name: str, folder: Path, place: str) -> Path:
-    """A path below a folder, by its place there, which the argument `name` holds; raises if that leads out of it."""
+    """The path of a `place` in a folder; raises if it leads out of the folder. `name` is the argument that holds it."""
     if Path(place).is_absolute() or ".." in Path(place).parts:
         raise InvalidInputError(f"`{name}` is {place!r}, which leads out of {str(folder)!r}; name a place in it.")
     return folder / place
@@ -221,7 +222,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
             download_options[option] = options[option]
     problem = f"`{name}` is {str(place)!r}, no folder here, and no repository that can be fetched"
     kinds = (OSError, ValueError, ImportError)  # ValueError: no id; ImportError: a SOCKS proxy
-    with explain_errors(problem, "pass another", *kinds):
+    with explain_errors(problem, "pass the path of a folder, or the id of a repository", *kinds):
         return Path(snapshot_download(str(place), **download_options))
 
 
@@ -339,9 +340,9 @@ def _check_cells(file: Path, names: Sequence[str], cells: Sequence[Sequence[str]
     if not cells:
         wrong = "no rows"
     elif odd:
-        wrong = f"other columns in row {', '.join(odd[:5])}; quote texts that hold commas"
+        wrong = f"another number of columns in row {', '.join(odd[:5])}; quote texts that hold commas"
     elif len(set(names)) < len(names):
-        wrong = "two of one name"
+        wrong = "two columns of one name"
     if wrong:
         raise InvalidInputError(f"{str(file)!r} has the columns {[*names]}, and {wrong}.")
 

@@ -73,7 +73,7 @@ class RunReport:
     #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)  #: sensor whose tokens each touch got
-    #: of each touch, or of its `background`, to that sensor; to the nearest where it got no tokens
+    #: distance of each touch, or of its `background`, to that sensor; to the nearest where it got no tokens
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)
@@ -162,7 +162,7 @@ def prepare_scheduler(scheduler: Any, steps: int | list[int], init_strength: flo
     options: dict[str, Any] = {argument: steps, "device": device}
     parameters = inspect.signature(scheduler.set_timesteps).parameters
     if argument not in parameters:
-        check_unused(f"with {kind}, which chooses its own", **{argument: steps})
+        raise InvalidInputError(f"`{argument}` is {describe(steps)}, but {kind} chooses its own; leave it out.")
     problem = f"`{argument}` is {steps}, which {kind} cannot run"
     with explain_errors(problem, "take other steps, or name a `solver`", ValueError, IndexError, ZeroDivisionError):
         if "strength" in parameters:  # of LCM and TCD
@@ -189,7 +189,7 @@ def truncate_schedule(scheduler: Any, share: float) -> Any:
     betas = getattr(scheduler, "betas", None)
     if "trained_betas" not in config or config.get("use_flow_sigmas") or betas is None:
         kind = type(scheduler).__name__
-        raise InvalidInputError(f"`init_strength` is {share:g}, but {kind} starts at noise alone; name a `solver`.")
+        raise InvalidInputError(f"`init_strength` is {share:g}, but {kind} can only start from noise; name a `solver`.")
     scheduler.set_timesteps(100)
     spacing = scheduler.timesteps.unique()  # from the smallest
     levels = max(round(float(spacing[max(round(share * len(spacing)), 1) - 1])) + 1, 2)
@@ -263,7 +263,7 @@ class Denoiser:
         return denoised if self.edit is None else self.edit(denoised)
 
     def timestep(self, sigma: float, device: torch.device) -> Tensor:
-        """The timestep of a noise level, float32 (); it is made on the device, which nothing waits for."""
+        """The timestep of a noise level, float32 (); made on the device, so that nothing waits for a copy."""
         return torch.full((), self.schedule.timestep(sigma).item(), dtype=torch.float32, device=device)
 
     def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
@@ -342,7 +342,7 @@ class SampleStatus:
         self.diverged_at = torch.where(diverged, self.diverged_at.clamp(max=step), self.diverged_at)
 
     def conclude(self, report: RunReport, denoise: Denoiser, ended: ReturnCode, throw: bool) -> None:
-        """Writes counts and return codes into the report of a run, `ended` for samples that are well.
+        """Writes counts and return codes into the report of a run; `ended` is the code of samples that did not fail.
 
         Raises:
             NonFiniteError: If a sample is not finite and `throw` is set.

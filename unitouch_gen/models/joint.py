@@ -43,7 +43,7 @@ MODALITIES = tuple(MODULES)
 
 UNLIKE = "unlike anything known"
 UNTOUCHED = "nothing is touched"
-"""Reasons why a model does not name a touch."""
+"""Reasons why the result for a touch is a guess, as in `RunReport.unknown`."""
 
 _READING = threading.Lock()  # held while an encoder is read, so that threads that share a model read it once
 
@@ -322,9 +322,8 @@ def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor
     names = {f"model{suffix}.safetensors"}
     if index.is_file():
         weight_map = read_settings("source", index)["weight_map"]
-        names = {
-            Path(file).name for file in weight_map.values()
-        }  # names alone, so that no file is outside of the folder
+        # Names alone, so that no file is outside of the folder.
+        names = {Path(file).name for file in weight_map.values()}
     tensors = dict[str, Tensor]()
     for file in sorted(folder / name for name in names):
         check_file("source", file, "weights")  # opening a pipe would block
@@ -373,7 +372,7 @@ class RelativeDistance(nn.Module):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "RelativeDistance":
-        """Builds it from the state dict of a joint space."""
+        """Builds the distance from the state dict of a joint space."""
 
         def gaussians(group: str) -> Gaussians:
             prefix = f"out_of_distribution.touch.groups.{group}"
@@ -408,14 +407,14 @@ def touch_statistics(patches: Tensor, pixel_values: Tensor) -> Tensor:
     eigenvalues = torch.linalg.eigvalsh(covariance).clamp_min(1e-9).log()
     mean = pixels.mean(dim=(-2, -1))
     spread = F.adaptive_avg_pool2d(pixels, 8).flatten(2).std(dim=2)
-    of_pixels = torch.cat([mean, spread, correlations, eigenvalues], dim=1)
-    return torch.cat([patches.float().mean(dim=(-2, -1)), of_pixels.to(patches.device)], dim=1)
+    pixel_statistics = torch.cat([mean, spread, correlations, eigenvalues], dim=1)
+    return torch.cat([patches.float().mean(dim=(-2, -1)), pixel_statistics.to(patches.device)], dim=1)
 
 
 def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int) -> None:
-    """Warns once of all touches that have a reason not to be named; `stacklevel` as of `warnings.warn`."""
+    """Warns once of all touches with a reason, `UNLIKE` or `UNTOUCHED`; `stacklevel` as of `warnings.warn`."""
     rows = [row for row, reason in enumerate(reasons) if reason]
     names = {row: f"`touch[{row}]`" if len(reasons) > 1 else "`touch`" for row in rows}
     listed = "; ".join(f"{names[row]}: {reasons[row]}" for row in rows[:3])
     more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
-    warnings.warn(f"{listed}{more}. What is made of it is a guess.", UnfamiliarInputWarning, stacklevel=stacklevel)
+    warnings.warn(f"{listed}{more}. The result is a guess.", UnfamiliarInputWarning, stacklevel=stacklevel)

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, check_unused, one_each
+from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, describe, one_each
 
 Sensors = str | Sequence[str | None] | None
 """A name for all images, one for each, or `None` to retrieve them."""
@@ -68,7 +68,7 @@ class SensorBank(nn.Module):
     def index(self, name: str) -> int:
         """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
         if not self.names:
-            check_unused("on a model without sensor tokens", sensor=name)
+            raise InvalidInputError(f"`sensor` is {describe(name)}, but this model has no sensor tokens; leave it out.")
         hint = "For the touches of any other, leave `sensor` out." if bool(self.known.any()) else ""
         return self.names.index(check_choice("sensor", name, self.names, hint=hint))
 
