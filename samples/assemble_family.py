@@ -18,7 +18,7 @@ from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.saving import filling
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.family import FINAL_RUNS, STAGES
-from unitouch_gen.training.stages import weights_of
+from unitouch_gen.training.stages import hash_weights
 from unitouch_gen.training.touch_llm import PROMPT
 
 # Defaults of the tiny pipelines, chosen on the validation split. A touch determines a picture less than the picture's
@@ -64,7 +64,7 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
             raise InvalidInputError(f"`runs` lacks {str(file)!r}; make it with: {command}")
         records[run.name] = json.loads(file.read_text())
         for option, before in STAGES[run.name].takes.items():
-            if records[run.name]["inputs"][option] != weights_of(runs / before / "model"):
+            if records[run.name]["inputs"][option] != hash_weights(runs / before / "model"):
                 why = f"which was built on other weights than {before} holds now; remove it, and train it anew."
                 raise InvalidInputError(f"`runs` holds {str(folder)!r}, {why}")
     return records

@@ -1,7 +1,7 @@
 """The autoencoder of pictures (stage `image_vae`) and of touches (stage `touch_vae`).
 
-Recipes take two classes. `AutoencoderTiny` (after TAESD, Boer Bohan, 2023) fits diffusers' own unCLIP pipelines in the
-place of an `AutoencoderKL`, at a fraction of its time. `VQModel` (Esser et al., 2021) is the paper's.
+The recipe's `model.class` is one of two. `AutoencoderTiny` (after TAESD, Boer Bohan, 2023) fits diffusers' own unCLIP
+pipelines in the place of an `AutoencoderKL`, at a fraction of its time. `VQModel` (Esser et al., 2021) is the paper's.
 """
 
 import json
@@ -47,10 +47,11 @@ class AutoencoderLoss(Settings):
     # Deviation of noise on the latents, relative to theirs. The decoder learns to ignore a generator's last errors.
     latent_noise: NonNegativeFloat
     latent_weight: NonNegativeFloat  # of the latents' mean square, which keeps them bounded
-    # Of `feature_error`: of touches by the stem of the joint space's touch encoder, of pictures by its texture trunk.
+    # Weight of `feature_error`. The features of touches are of the stem of the joint space's touch encoder, those of
+    # pictures of its texture trunk.
     feature_weight: NonNegativeFloat = 0.0
-    # Of `contrast_error`, by the same features. Fine grain is more than latents can hold: the error of pixels is least
-    # where it is averaged away, this one where as much of it is drawn as there was.
+    # Weight of `contrast_error`, by the same features. Latents cannot hold fine grain. The error of pixels is least for
+    # a picture with the grain averaged away, this one for a picture with as much grain as the original.
     contrast_weight: NonNegativeFloat = 0.0
     trunk: str | None = None  # folder of a joint space to take the texture trunk from; the built-in one if left out
 
@@ -139,8 +140,8 @@ class AutoencoderObjective(nn.Module):
         for name, part in parts.items():
             loss = loss + getattr(self.weights, f"{name}_weight") * part
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # of pixels in [0, 1]
-        shown = {name: part.detach() for name, part in parts.items()}
-        return {"loss": loss, "psnr": psnr, "latent": latent_size.detach(), **shown}
+        logged = {name: part.detach() for name, part in parts.items()}
+        return {"loss": loss, "psnr": psnr, "latent": latent_size.detach(), **logged}
 
     def feature_losses(self, restored: Tensor, pixels: Tensor) -> dict[str, Tensor]:
         """The losses of features of images in [-1, 1], by the names of their weights."""

@@ -47,7 +47,7 @@ class Stage:
     """One call of a stage's command, with its options as arguments.
 
     `recipe` is read as settings of a `kind`; `recipe_values` is the same as plain values, for checkpoints and the
-    record. `folders` are the models that were named, by option, and `inputs` hashes of their weights.
+    record. `folders` are the models that were named, by option, and `inputs` are hashes of their weights.
     """
 
     def __init__(
@@ -81,7 +81,8 @@ class Stage:
         if resume:
             if recipe is not None:
                 raise InvalidInputError(
-                    "`recipe` is the checkpoint's with `--resume`; leave it out. `--set` changes it."
+                    "`recipe` cannot be passed with `--resume`, which reads the checkpoint's; leave it out, and change "
+                    "values by `--set`."
                 )
             self.recipe_values = overridden(progress["recipe"], changes)
         else:
@@ -90,9 +91,9 @@ class Stage:
         self.recipe: Any = read(kind, self.recipe_values)
         self.trainer = self.recipe.trainer
         self.data = self.recipe.data
-        self.batches: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
+        self.batch_options: dict[str, Any] = {"batch_size": self.trainer.batch_size, "seed": self.trainer.seed}
         self.folders = named_folders(name, joint=joint, vae=vae, llama=llama, init=init, model=model)
-        self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
+        self.inputs = {option: hash_weights(folder) for option, folder in self.folders.items()}
         if resume:
             self._check_inputs(progress["inputs"])
         self.sources = self.data.sources()
@@ -181,13 +182,13 @@ class Stage:
         return self.computed_once("image-embeddings", "joint", splits, compute)
 
     def sampler(self, settings: SamplerSettings, splits: list[Contacts], embeds: Tensor) -> Indices:
-        """Batches in groups whose embeddings (N, D) are alike."""
+        """Sample indices of batches, in groups whose embeddings (N, D) are alike."""
         sizes = [len(split) for split in splits]
         near = F.normalize(embeds.float(), dim=1).numpy()
-        return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batches)
+        return partial(in_batch_indices, sizes=sizes, settings=settings, near=near, **self.batch_options)
 
     def check_drawn(self, *weights: str) -> None:
-        """Raises if there are data sets, and `weights` of the objective are for what only drawn contacts have."""
+        """Raises if there are data sets, and losses with `weights` above 0 need what only drawn contacts have."""
         if weights and not all(isinstance(source, DrawnContacts) for source in self.sources):
             names = ", ".join(f"`objective.{name}`" for name in weights)
             raise InvalidInputError(f"{names} need `data.drawn` alone; set these to 0, or leave out `data.sets`.")
@@ -199,7 +200,7 @@ class Stage:
         """
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the cache is filled; the other processes go on and read it
-        indices_of = indices_of or partial(shuffled_indices, size=len(dataset), **self.batches)
+        indices_of = indices_of or partial(shuffled_indices, size=len(dataset), **self.batch_options)
         progress = {
             "inputs": self.inputs,
             "recipe": self.recipe_values,
@@ -273,7 +274,7 @@ def named_folders(name: str, **folders: Path | None) -> dict[str, Path]:
     return named
 
 
-def weights_of(folder: Path) -> str:
+def hash_weights(folder: Path) -> str:
     """SHA-256 of the names and bytes of all safetensors below a folder, also behind links."""
     digest = hashlib.sha256()
     # A save that was cut off leaves hidden files.

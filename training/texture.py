@@ -21,10 +21,10 @@ from unitouch_gen.models.joint import stored_tensors
 from unitouch_gen.models.texture import Texture, TextureHead, TextureTrunk
 from unitouch_gen.models.vit import StemmedCLIPVisionModel
 from unitouch_gen.training.batches import ArrayDataset, Batch, two_part_indices
-from unitouch_gen.training.data import Contacts
+from unitouch_gen.training.data import Contacts, DrawnContacts
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Recipe, Stage, weights_of
+from unitouch_gen.training.stages import Recipe, Stage, hash_weights
 from unitouch_gen.training.touch import fit_distance
 from unitouch_gen.weights import JOINT
 from unitouch_gen.world import MATERIAL_NAMES
@@ -82,9 +82,10 @@ class TextureObjective(nn.Module):
         image = self.embedded(self.image, batch, "image")
         touch = self.embedded(self.touch, batch, "touch")
         second = self.embedded(self.touch, batch, "second")
-        bound = symmetric_info_nce(touch, image, self.temperature) + symmetric_info_nce(second, image, self.temperature)
+        touch_to_image = symmetric_info_nce(touch, image, self.temperature)
+        second_to_image = symmetric_info_nce(second, image, self.temperature)
         parts = {
-            "image": bound,
+            "image": touch_to_image + second_to_image,
             "touch": symmetric_info_nce(touch, second, self.temperature),
             "text": symmetric_info_nce(image, batch["text_embeds"], self.temperature),
             "image_name": self.name_loss(image, batch["material"]),
@@ -183,7 +184,7 @@ def cached_statistics(
     stage: Stage, settings: TextureSettings, trunk: TextureTrunk, name: str, splits: list[Contacts]
 ) -> Tensor:
     """`texture_statistics` of a column of all splits, cached by the weights of the trunk."""
-    trunk_hash = weights_of(settings.trunk_folder)[:16]
+    trunk_hash = hash_weights(settings.trunk_folder)[:16]
 
     def compute() -> Tensor:
         return torch.cat([texture_statistics(trunk, getattr(split, name)) for split in splits])
@@ -192,7 +193,8 @@ def cached_statistics(
 
 
 def main(stage: Stage, recipe: TextureRecipe) -> None:
-    stage.check_drawn(*recipe.objective.model_dump(exclude={"noise"}))
+    if not all(isinstance(source, DrawnContacts) for source in stage.sources):
+        raise InvalidInputError("`data.sets` cannot be used here: texture needs drawn contacts; leave it out.")
     model = stage.joint_space("image", "text", "touch")
     check_takes_texture(model)
     splits = stage.splits("image", "touch", "text")
@@ -214,7 +216,7 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
 
     objective = TextureObjective(model, recipe.objective, name_embeddings(model, stage.processor))
     is_scanned = (columns["drawn"] == 0.0).numpy()
-    indices_of = partial(two_part_indices, in_first=is_scanned, share=recipe.scanned, **stage.batches)
+    indices_of = partial(two_part_indices, in_first=is_scanned, share=recipe.scanned, **stage.batch_options)
     stage.fit(objective, ArrayDataset(**columns), indices_of)
     with torch.no_grad():
         embeds = columns["image_embeds"] + pictures.head(columns["image_statistics"])

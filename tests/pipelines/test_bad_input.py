@@ -39,7 +39,7 @@ GENERATOR = torch.Generator()
 
 # Calls ----------------------------------------------------------------------------------------------------------------
 
-# Of an argument, values that cannot be used, and then values of a kind that cannot be.
+# By argument: values that raise `InvalidInputError`, then values that raise `InvalidTypeError`.
 NUMBERS = {
     "guidance_scale": ([NAN, INF, -1e-9, 1e7], ["9", True, [3.0], 10**400, Fraction(10**400)]),
     "num_inference_steps": ([0, 10**9], [2.5, "10", True, np.zeros((3, 3)), torch.tensor([])]),

@@ -23,7 +23,7 @@ from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.commands import app
 from unitouch_gen.training.family import FINAL_RUNS, RUNS, STAGES
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.training.stages import Stage, weights_of
+from unitouch_gen.training.stages import Stage, hash_weights
 from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.world import World
 
@@ -91,7 +91,7 @@ def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path)
         record = json.loads((runs / name / "record.json").read_text())
         assert (record["stage"], record["trainer"]["steps"], record["seed"]) == (name, 2, 0)
         assert record["inputs"] == {
-            option: weights_of(runs / stage / "model") for option, stage in STAGES[name].takes.items()
+            option: hash_weights(runs / stage / "model") for option, stage in STAGES[name].takes.items()
         }
         lines = [json.loads(line) for line in (runs / name / "log.jsonl").read_text().splitlines()]
         assert np.isfinite([line["loss"] for line in lines if "loss" in line]).all()
@@ -138,9 +138,9 @@ def test_weights_behind_links_count_in_their_hash(tmp_path: Path) -> None:
         save_file({"a": torch.full((2,), value)}, tmp_path / f"weights-{name}" / "model.safetensors")
         (tmp_path / name).mkdir()
         (tmp_path / name / "unitouch").symlink_to(tmp_path / f"weights-{name}")
-    assert weights_of(tmp_path / "one") != weights_of(tmp_path / "other")
+    assert hash_weights(tmp_path / "one") != hash_weights(tmp_path / "other")
     shutil.copytree(tmp_path / "one", tmp_path / "copy")  # which follows the link
-    assert weights_of(tmp_path / "one") == weights_of(tmp_path / "copy")
+    assert hash_weights(tmp_path / "one") == hash_weights(tmp_path / "copy")
 
 
 @pytest.fixture(scope="module")
@@ -198,14 +198,14 @@ def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_oth
 
 def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(joint: str, tmp_path: Path) -> None:
     recipe = read_recipe("touch", ["sampler.sigma=0.5"])
-    inputs = {"joint": weights_of(Path(joint))}
+    inputs = {"joint": hash_weights(Path(joint))}
     place = tmp_path / "checkpoints" / "step-00000001"
     place.mkdir(parents=True)
     (place / "progress.json").write_text(json.dumps({"step": 1, "seconds": 1.0, "recipe": recipe, "inputs": inputs}))
     given = {"joint": Path(joint), "output": tmp_path, "resume": True}
     found = Stage("touch", TouchRecipe, overrides=["trainer.steps=3"], **given)
     assert (found.recipe.sampler.sigma, found.trainer.steps) == (0.5, 3)
-    with pytest.raises(InvalidInputError, match="`recipe` is the checkpoint's"):
+    with pytest.raises(InvalidInputError, match="`recipe` cannot be passed with `--resume`"):
         Stage("touch", TouchRecipe, recipe="touch_pairs", **given)
     file = next(Path(joint).rglob("*.safetensors"))
     save_file({"weight": torch.ones(2)}, file)
