@@ -98,9 +98,9 @@ def test_extras_that_are_missing_or_cannot_be_imported_are_named(tmp_path, monke
     (tmp_path / "broken_extra.py").write_text("raise ImportError('Using SOCKS proxy, without its package.')")
     monkeypatch.syspath_prepend(tmp_path)
     missing = r'is missing: pip install "unitouch_gen\[train\]"'
-    check_refusal(partial(errors.needed, "no_such_module"), "no_such_module", missing)
+    check_refusal(partial(errors.import_optional, "no_such_module"), "no_such_module", missing)
     broken = r"cannot be imported \(Using SOCKS proxy.*: pip install"
-    check_refusal(partial(errors.needed, "broken_extra"), "broken_extra", broken)
+    check_refusal(partial(errors.import_optional, "broken_extra"), "broken_extra", broken)
 
 
 def test_whatever_a_library_raises_is_one_error_that_names_the_outermost_argument(tmp_path):
