@@ -110,8 +110,7 @@ def test_local_contrast_is_detail_over_its_deviation() -> None:
 def test_half_precision_errs_by_less_than_with_a_rounded_sum() -> None:
     config = UniTouchViTConfig(**{**TINY, "hidden_size": 64, "num_hidden_layers": 24})
     torch.manual_seed(0)
-    others = {f"{modality}_config": {"projection_dim": 12} for modality in ("vision", "text", "audio")}
-    joint = UniTouchConfig(touch_config=config.to_dict(), projection_dim=12, **others)
+    joint = UniTouchConfig(touch_config=config.to_dict(), projection_dim=12)
     vit = UniTouchModel(joint, modalities=("touch",)).eval().touch_model
     pixels = torch.randn(16, 3, 24, 40)
     expected = reference(vit, config, pixels, None)

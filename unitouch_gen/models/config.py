@@ -147,7 +147,7 @@ class UniTouchConfig(PreTrainedConfig):
     Args:
         vision_config, text_config: transformers' CLIP configurations. The first may have a `stem`, "patch" or
             "residual". With the latter it may have `patch_channels` and `texture_width`, as in `UniTouchViTConfig`.
-        touch_config, audio_config: Each a `UniTouchViTConfig`.
+        touch_config, audio_config: Each a `UniTouchViTConfig`. Encoders without a configuration have the paper's sizes.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
@@ -186,11 +186,15 @@ class UniTouchConfig(PreTrainedConfig):
         check_spelling(UniTouchConfig, kwargs)
         for name in self.sub_configs_defaults:
             check_kind(name, getattr(self, name), dict, PreTrainedConfig, NoneType)
+        check_integer("projection_dim", self.projection_dim, 1)
+        for name, spec in self.sub_configs_defaults.items():
+            if getattr(self, name) is None:  # such as of a modality that was added after the space was saved
+                setattr(self, name, {**spec.init_kwargs, "projection_dim": self.projection_dim})
         try:
             super().__post_init__(**kwargs)
         except StrictDataclassError as error:  # from CLIP's configurations; it is no `ValueError`
             raise InvalidInputError(f"`vision_config` or `text_config`: {error.__cause__}") from error
-        for name in ("projection_dim", "sensor_tokens", "prototype_size"):
+        for name in ("sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30)
