@@ -469,6 +469,7 @@ def test_contacts_that_cannot_be_drawn_are_refused(tmp_path):
 
     colours = partial(columns, ("image", "touch"), scanned=1.0, colours_alone=True)
     check_refusal(colours, "data.drawn.colours_alone", "is true, but this stage needs touches")
+    check_refusal(partial(columns, ("image", "gel")), "data.drawn", "renders no gel, which this stage needs")
     check_refusal(partial(columns, (), 64), "touch_size", "is 64; with drawn sensors")
     both = DataConfig(drawn=DrawnConfig(objects=1, contacts_per_object=1), sets=[{"path": str(tmp_path)}])
     check_refusal(both.sources, "data", "takes one of the two")

@@ -64,6 +64,9 @@ class DataConfig(Settings):
 FIELDS = {"image": "picture", "gel": "background", "audio": "sound", "text": "caption"}
 """Fields of a record by the names of columns; other columns have the names of their fields."""
 
+OF_WORLD = ("image", "touch", "audio", "text", "sensor")
+"""Columns that drawn contacts have, of those that a stage may need."""
+
 ColumnKind = tuple[Any, ...]  # dtype, then shape of a row
 
 
@@ -84,7 +87,7 @@ def columns_of(
     `needs` are names of columns, see `has`. Other columns of data sets stay empty.
 
     Raises:
-        InvalidInputError: If a data set lacks a column, or files cannot be read.
+        InvalidInputError: If a data set or the world lacks a column, or files cannot be read.
     """
     for source in sources:
         if isinstance(source, RecordSet):
@@ -93,6 +96,11 @@ def columns_of(
         raise InvalidInputError(
             "`data.drawn.colours_alone` is true, but this stage needs touches, and surfaces without heights feel flat; "
             "leave it out."
+        )
+    unknown = [column for column in needs if column not in OF_WORLD]
+    if config.drawn is not None and unknown:
+        raise InvalidInputError(
+            f"`data.drawn` renders no {' and no '.join(unknown)}, which this stage needs; pass `data.sets`."
         )
     if config.touch_size not in (None, processor.image_size) and config.drawn is not None:
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
