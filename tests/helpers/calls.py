@@ -10,6 +10,7 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWi
 
 from tests.helpers.components import D
 from unitouch_gen.conditioning import SensorBackgrounds
+from unitouch_gen.models.joint import MODULES
 from unitouch_gen.pipelines import XToTouchPipeline
 
 
@@ -46,7 +47,7 @@ def networks_of(pipe: Any) -> dict[str, nn.Module]:
     """By their names in `report.left_out`."""
     found = {"UNet": pipe.unet, "VAE encoder": pipe.vae.encoder, "VAE decoder": pipe.vae.decoder}
     if pipe.unitouch is not None:
-        modules = {"image": "vision_model", "text": "text_model", "audio": "audio_model", "touch": "touch_model.stem"}
+        modules = {name: first for name, (first, *_) in MODULES.items()} | {"touch": "touch_model.stem"}
         found |= {f"{modality} encoder": pipe.unitouch.get_submodule(name) for modality, name in modules.items()}
     return found | ({} if pipe.text_encoder is None else {"prompt encoder": pipe.text_encoder})
 
