@@ -272,7 +272,7 @@ def test_sensors_that_a_bank_does_not_hold_are_refused():
     bank = SensorBank(("gelsight", "digit"), 5, 16, 8)
     check_refusal(partial(bank.match, torch.zeros(1, 3, 8, 8)), "sensor", "is None.*no prototypes.*gelsight")
     none = SensorBank((), 5, 16, 8)
-    check_refusal(partial(none.match, torch.zeros(1, 3, 8, 8), "digit"), "sensor", "without sensor tokens")
+    check_refusal(partial(none.match, torch.zeros(1, 3, 8, 8), "digit"), "sensor", "has no sensor tokens")
 
 
 def test_language_models_that_do_not_fit_a_bridge_are_refused():
@@ -338,9 +338,9 @@ STEPS: list[Row] = [
     ({"timesteps": [500, 999]}, "is .*; each has to be below the one before"),
     ({"timesteps": [1000, 1]}, "is 1000"),
     ({"timesteps": 5}, "is"),
-    ({"timesteps": [999, 9]}, "DDIMScheduler, which chooses its own"),
+    ({"timesteps": [999, 9]}, "DDIMScheduler chooses its own"),
     ({"timesteps": [99, 9], "scheduler": diffusers.DDPMScheduler()}, "99, 9], .* starts at timestep 99 of 1000"),
-    ({"init_strength": 0.5, "scheduler": FLOW}, "starts at noise alone"),
+    ({"init_strength": 0.5, "scheduler": FLOW}, "can only start from noise"),
     (
         {"num_inference_steps": 1000, "scheduler": diffusers.DDIMScheduler(steps_offset=1)},
         "1000, with .* timestep 1000 of",
