@@ -14,7 +14,8 @@ import typer
 from diffusers import DDPMScheduler, DEISMultistepScheduler, EulerAncestralDiscreteScheduler
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.commands import run_commands
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.saving import filling
 from unitouch_gen.schedule import TRAINED
 from unitouch_gen.training.family import FINAL_RUNS, STAGES

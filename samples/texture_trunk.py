@@ -14,8 +14,8 @@ import typer
 from safetensors.torch import save_file
 from torch import Tensor
 
+from unitouch_gen.commands import run_commands
 from unitouch_gen.convert import open_checkpoint
-from unitouch_gen.errors import run_commands
 from unitouch_gen.models.texture import TextureTrunk
 from unitouch_gen.saving import filling
 from unitouch_gen.training.texture import TRUNK

@@ -21,7 +21,7 @@ from pathlib import Path
 import typer
 
 from unitouch_gen.cli.options import is_quiet, note, print_table
-from unitouch_gen.errors import run_commands
+from unitouch_gen.commands import run_commands
 
 app = typer.Typer()
 

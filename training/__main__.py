@@ -2,7 +2,7 @@
 
 import sys
 
-from unitouch_gen.errors import run_commands, wait_passively
+from unitouch_gen.commands import run_commands, wait_passively
 
 if __name__ == "__main__":
     wait_passively()

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from typer import Option, echo
 
-from unitouch_gen.errors import interrupt_on_termination
+from unitouch_gen.commands import interrupt_on_termination
 from unitouch_gen.training.checkpoints import checkpoints_in
 
 

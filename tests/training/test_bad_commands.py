@@ -19,7 +19,7 @@ from tests.helpers.refusals import check_refusal
 from tests.helpers.small_family import write_small_family
 from tests.training.conftest import read_as
 from unitouch_gen import tiny
-from unitouch_gen.errors import run_commands
+from unitouch_gen.commands import run_commands
 from unitouch_gen.training.batches import shuffled_indices
 from unitouch_gen.training.commands import app
 from unitouch_gen.training.losses import denoising_loss

@@ -19,7 +19,8 @@ from tests.helpers.components import make_components, make_pipelines
 from tests.helpers.small_family import write_small_family
 from unitouch_gen import tiny
 from unitouch_gen.cli import commands
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.commands import run_commands
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.checkpoints import checkpoints_in
 from unitouch_gen.training.commands import app
 from unitouch_gen.training.distill import DistillObjective, DistillSettings, add_layers, teacher_objective

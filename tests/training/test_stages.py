@@ -16,7 +16,8 @@ from safetensors.torch import load_file, save_file
 
 from assemble_family import assemble
 from tests.helpers.components import AUDIO, SPACE
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.commands import run_commands
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.training.checkpoints import checkpoints_in

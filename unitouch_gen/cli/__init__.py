@@ -17,7 +17,7 @@ from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.numerics import stability, work_precision
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.press import press
-from unitouch_gen.errors import interrupt_on_termination, run_commands, wait_passively
+from unitouch_gen.commands import interrupt_on_termination, run_commands, wait_passively
 
 commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 

@@ -11,7 +11,8 @@ from accelerate.state import AcceleratorState
 from PIL import Image
 
 from tests.helpers.data_sets import RED, write_image
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.commands import run_commands
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.commands import app
 from unitouch_gen.training.data import Contacts, DataConfig, columns_of, computed_once, open_dataset
