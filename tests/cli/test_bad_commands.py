@@ -106,7 +106,7 @@ BAD = {
     "combinations": [
         (TO_TOUCH, "Pass at least one of `--image`, `--text`"),
         (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` holds 2 for 3 inputs"),
-        (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
+        (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` has keys smell"),
         ("convert unitouch -o out", "Pass at least one of `imagebind`, `touch`"),
         ("work-precision -o out", "Pass exactly one of `--problem`, `--pipeline`"),
         (f"{CHART} --model in", "has no effect with `--problem`"),
