@@ -64,6 +64,6 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
 def test_unknown_touches_are_told_by_their_places_in_one_line() -> None:
     with pytest.warns(UnfamiliarInputWarning, match="^`touch`: unlike anything known. The result"):
         warn_of_unknown([UNLIKE], 2)
-    many = "^`touch.1.`: nothing is touched; `touch.2.`: unlike anything known; .* and 3 more. What"
+    many = "^`touch.1.`: nothing is touched; `touch.2.`: unlike anything known; .* and 3 more. The result"
     with pytest.warns(UnfamiliarInputWarning, match=many):
         warn_of_unknown([None, UNTOUCHED, *5 * [UNLIKE]], 2)
