@@ -168,6 +168,16 @@ def test_a_plan_of_a_save_that_leads_out_of_its_folder_is_not_followed(tmp_path)
         pass
 
 
+def test_a_plan_of_a_save_that_is_damaged_moves_nothing(tmp_path):
+    write_file("x", tmp_path / "old.txt", "old")
+    write_file("x", tmp_path / ".new.txt", "new")
+    for damaged in (["old.txt"], ["a", "b", "c"], 3, [1, 2]):
+        (tmp_path / UNFINISHED).write_text(json.dumps({"moves": [[".new.txt", "old.txt"], damaged], "removed": []}))
+        with pytest.raises(InvalidInputError, match="is no plan of a save"), reading("model", tmp_path):
+            pass
+        assert (tmp_path / "old.txt").read_text() == "old"
+
+
 def test_two_components_in_one_folder_are_refused_before_anything_changes(tmp_path):
     write_file("x", tmp_path / "one" / "a.txt", "old")
     (tmp_path / "other").symlink_to("one")

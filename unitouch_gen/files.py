@@ -172,7 +172,10 @@ def finish_save(folder: Path) -> None:
     # What a plan holds may be of any type.
     with explain_errors(f"`{file}` is no plan of a save", "save again", ValueError, TypeError, LookupError):
         plan = json.loads(file.read_text())
-        moves = [[path_inside(str(file), folder, place) for place in move] for move in plan["moves"]]
+        moves = [
+            (path_inside(str(file), folder, hidden), path_inside(str(file), folder, destination))
+            for hidden, destination in plan["moves"]
+        ]
         removed = [path_inside(str(file), folder, place) for place in plan["removed"]]
     for hidden, destination in moves:
         if os.path.lexists(hidden):  # it has not been moved yet
