@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from unitouch_gen.training.family import FOLDERS, STAGES, folders_of, train_family
+from unitouch_gen.training.family import STAGES, folders_of, train_family
 from unitouch_gen.training.stages import Recipe, Stage, run_stage
 
 HELP = "Training by its stages: `python -m unitouch_gen.training STAGE`."
@@ -21,7 +21,7 @@ def add_command(name: str, description: str) -> None:
         run_stage(name, **options)
 
     all_options = signature(partial(Stage, name, Recipe))
-    other_folders = {*FOLDERS} - folders_of(name)
+    other_folders = set[str]().union(*map(folders_of, STAGES)) - folders_of(name)
     parameters = [parameter for option, parameter in all_options.parameters.items() if option not in other_folders]
     command.__signature__ = all_options.replace(parameters=parameters)  # type: ignore[attr-defined]
     app.command(name, help=description)(command)

@@ -58,9 +58,6 @@ STAGES = {
 }
 """All stages by name. `distill` is no part of a family."""
 
-FOLDERS = ("joint", "vae", "llama", "init", "model")
-"""Options that name folders of models."""
-
 
 @dataclass(frozen=True)
 class Run:

@@ -180,16 +180,13 @@ def texture_statistics(trunk: TextureTrunk, images: Any) -> Tensor:
     return in_batches(len(images), lambda rows: trunk(float_pixels(images[rows])), size=32)
 
 
-def cached_statistics(
-    stage: Stage, settings: TextureSettings, trunk: TextureTrunk, name: str, splits: list[Contacts]
-) -> Tensor:
-    """`texture_statistics` of a column of all splits, cached by the weights of the trunk."""
-    trunk_hash = hash_weights(settings.trunk_folder)[:16]
+def cached_statistics(stage: Stage, trunk: TextureTrunk, trunk_hash: str, name: str, splits: list[Contacts]) -> Tensor:
+    """`texture_statistics` of a column of all splits, cached by the hash of the trunk's weights."""
 
     def compute() -> Tensor:
         return torch.cat([texture_statistics(trunk, getattr(split, name)) for split in splits])
 
-    return stage.computed_once(f"{name}-texture-{trunk_hash}", "joint", splits, compute)
+    return stage.computed_once(f"{name}-texture-{trunk_hash[:16]}", "joint", splits, compute)
 
 
 def main(stage: Stage, recipe: TextureRecipe) -> None:
@@ -209,8 +206,9 @@ def main(stage: Stage, recipe: TextureRecipe) -> None:
     }
     add_texture(model, recipe.model)
     pictures, touches = textures_of(model)
+    trunk_hash = hash_weights(recipe.model.trunk_folder)
     for name in ("image", "touch", "second"):
-        columns[f"{name}_statistics"] = cached_statistics(stage, recipe.model, pictures.trunk, name, splits)
+        columns[f"{name}_statistics"] = cached_statistics(stage, pictures.trunk, trunk_hash, name, splits)
     pictures.head.fit(columns["image_statistics"])
     touches.head.fit(torch.cat([columns["touch_statistics"], columns["second_statistics"]]))
 

@@ -56,6 +56,11 @@ class SamplingArguments(BaseModel):
     throw: bool = True
 
 
+def description(name: str) -> str | None:
+    """What a sampling argument is, for helps of options and the page."""
+    return SamplingArguments.model_fields[name].description
+
+
 def bounds(name: str) -> tuple[Any, Any]:
     """Smallest and largest value of a sampling argument; `None` where it has no bound."""
     constraints = SamplingArguments.model_fields[name].metadata

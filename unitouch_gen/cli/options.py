@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Context, Option
 
-from unitouch_gen.arguments import SamplingArguments, bounds
+from unitouch_gen.arguments import SamplingArguments, bounds, description
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.files import check_writable
 
@@ -27,7 +27,7 @@ SEVERAL = "files, folders, patterns or example:NAME"
 def sampling_option(name: str, *flags: str) -> Any:
     """The option of a sampling argument, with its bounds and its description."""
     low, high = bounds(name)
-    return Option(*flags, min=low, max=high, help=SamplingArguments.model_fields[name].description)
+    return Option(*flags, min=low, max=high, help=description(name))
 
 
 # Inputs and outputs

@@ -17,7 +17,7 @@ from gradio import processing_utils
 from gradio.utils import get_upload_folder
 from transformers import StoppingCriteriaList
 
-from unitouch_gen.arguments import SamplingArguments, bounds
+from unitouch_gen.arguments import bounds, description
 from unitouch_gen.cli.options import MAX_SEED
 from unitouch_gen.errors import InvalidInputError, check_integer, check_number, first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
@@ -313,11 +313,6 @@ def solver_fields(pipe: Any) -> Fields:
 def slider(name: str, label: str, value: float, *, most: float, step: float = 1) -> gradio.Slider:
     """A slider of a sampling argument, from its smallest value to the largest that the page offers."""
     return gradio.Slider(bounds(name)[0], most, value, step=step, label=label, info=description(name))
-
-
-def description(name: str) -> str | None:
-    """What a sampling argument is."""
-    return SamplingArguments.model_fields[name].description
 
 
 def answer(

@@ -7,6 +7,7 @@ is stationary (Gatys et al., 2015, "Texture synthesis using convolutional neural
 """
 
 from collections.abc import Sequence
+from itertools import islice
 
 import torch
 import torch.nn.functional as F
@@ -71,7 +72,7 @@ class TextureTrunk(nn.Module):
         """Outputs (B, C, h, w) of the blocks with the indices `tapped`, in ascending order."""
         x = F.relu6(self.stem((images * 255.0 - 127.0) / 128.0))  # the normalisation it was trained with
         outputs = []
-        for number, block in enumerate(self.blocks[: max(tapped) + 1]):
+        for number, block in enumerate(islice(self.blocks, max(tapped) + 1)):
             x = block(x)
             if number in tapped:
                 outputs.append(x)
